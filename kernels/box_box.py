@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contact manifold of two boxes: separating axes, then a clipped face (up to 8 points) or one edge-edge point."""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .collide import NO_POINT, pair_functions
+from .types import scalar_types
+
+
+@functools.cache
+def axes(real) -> SimpleNamespace:
+    """Separating-axis tests of box b in the frame of box a: d = centre of b, R = axes of b as columns."""
+    t = scalar_types(real)
+    vec3, mat33 = t.vec3, t.mat33
+
+    @wp.func
+    def face_separation(d: vec3, rotation: mat33, ha: vec3, hb: vec3, axis: int) -> real:
+        """Separation along face normal `axis` of the box that owns the frame."""
+        extent = ha[axis]
+        for k in range(3):
+            extent += wp.abs(rotation[axis, k]) * hb[k]
+        return wp.abs(d[axis]) - extent
+
+    @wp.func
+    def column(m: mat33, j: int) -> vec3:
+        return vec3(m[0, j], m[1, j], m[2, j])
+
+    @wp.func
+    def edge_axis(rotation: mat33, i: int, j: int) -> vec3:
+        """Unit normal to edge i of a and edge j of b; zero where the edges are parallel."""
+        e = vec3()
+        e[i] = real(1.0)
+        n = wp.cross(e, column(rotation, j))
+        length = wp.length(n)
+        if length < real(1.0e-3):
+            return vec3()
+        return n / length
+
+    @wp.func
+    def edge_separation(d: vec3, rotation: mat33, ha: vec3, hb: vec3, n: vec3) -> real:
+        extent = real(0.0)
+        for k in range(3):
+            extent += wp.abs(n[k]) * ha[k] + wp.abs(wp.dot(n, column(rotation, k))) * hb[k]
+        return wp.abs(wp.dot(d, n)) - extent
+
+    return SimpleNamespace(face_separation=face_separation, edge_axis=edge_axis, edge_separation=edge_separation, column=column)
+
+
+@functools.cache
+def polygon(real) -> SimpleNamespace:
+    """Sutherland-Hodgman clipping of a convex polygon of at most 8 vertices, held in registers."""
+    vec8 = wp.types.vector(length=8, dtype=real)
+    vec8i = wp.types.vector(length=8, dtype=int)
+
+    @wp.struct
+    class Polygon:
+        count: int
+        x: vec8  # in the plane of the reference face, m
+        y: vec8
+        z: vec8  # height above it, m
+        edge: vec8i  # which line leads from this vertex to the next: 0-3 incident face, 4-7 clipping planes
+
+    @wp.func
+    def append(p: Polygon, x: real, y: real, z: real, edge: int):
+        if p.count < 8:
+            p.x[p.count] = x
+            p.y[p.count] = y
+            p.z[p.count] = z
+            p.edge[p.count] = edge
+            p.count += 1
+        return p
+
+    @wp.func
+    def clip(p: Polygon, plane: int, half: real):
+        """Keep the part within one side of the reference face; plane = 0..3 for x <= half, -x <= half, y.., -y.."""
+        result = Polygon()
+        sign = real(1.0)
+        if plane % 2 == 1:
+            sign = real(-1.0)
+        # A corner that lies on the side keeps its identity, whatever the last bits say.
+        limit = half * real(1.0001)
+        for k in range(p.count):
+            m = (k + 1) % p.count
+            here = sign * p.x[k] - limit
+            there = sign * p.x[m] - limit
+            if plane >= 2:
+                here = sign * p.y[k] - limit
+                there = sign * p.y[m] - limit
+            if here <= real(0.0):
+                result = append(result, p.x[k], p.y[k], p.z[k], p.edge[k])
+            if (here <= real(0.0)) != (there <= real(0.0)):
+                s = here / (here - there)
+                edge = p.edge[k]
+                if here <= real(0.0):
+                    edge = 4 + plane
+                result = append(
+                    result, p.x[k] + s * (p.x[m] - p.x[k]), p.y[k] + s * (p.y[m] - p.y[k]), p.z[k] + s * (p.z[m] - p.z[k]), edge
+                )
+        return result
+
+    return SimpleNamespace(Polygon=Polygon, append=append, clip=clip)
+
+
+@functools.cache
+def make(real):
+    """Kernel ``box_box``; launch with dim (E, pairs of boxes)."""
+    t = scalar_types(real)
+    vec3, mat33, transform, spatial = t.vec3, t.mat33, t.transform, t.spatial
+    Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
+    f, a, p = pair_functions(real), axes(real), polygon(real)
+    shape_pose, write = f.shape_pose, f.write
+    face_separation, edge_axis, edge_separation, column = a.face_separation, a.edge_axis, a.edge_separation, a.column
+    Polygon, append, clip = p.Polygon, p.append, p.clip
+
+    @wp.func
+    def reach(topology: Topology, bodies: Bodies, env: int, shape: int, centre: vec3, h: real) -> real:
+        """Radius of the ball about a box's centre that it cannot leave within h."""
+        radius = wp.length(topology.shape_size[shape])
+        body = topology.shape_body[shape]
+        if body >= 0:
+            velocity = bodies.free_velocity[env, body]
+            lever = radius + wp.length(centre - bodies.com[env, body])
+            radius += real(2.0) * h * (wp.length(wp.spatial_top(velocity)) + wp.length(wp.spatial_bottom(velocity)) * lever)
+        return radius + real(0.01) * wp.length(topology.shape_size[shape])
+
+    @wp.func
+    def face_contacts(slots: Slots, env: int, slot: int, ref: transform, hr: vec3, inc: transform, hi: vec3, axis: int, flip: bool) -> int:
+        """Clip the incident face of one box against face `axis` of the reference box; returns the number of points."""
+        rotation = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(ref))) * wp.quat_to_matrix(wp.transform_get_rotation(inc))
+        d = wp.transform_point(wp.transform_inverse(ref), wp.transform_get_translation(inc))
+        side = real(1.0)
+        face = 2 * axis
+        if d[axis] < real(0.0):
+            side = real(-1.0)
+            face += 1
+        # Incident face: the one whose outward normal points most against the reference normal.
+        j = int(0)
+        for k in range(1, 3):
+            if wp.abs(rotation[axis, k]) > wp.abs(rotation[axis, j]) + real(1.0e-6):
+                j = k
+        top = real(-1.0)
+        incident = 2 * j
+        if side * rotation[axis, j] < real(0.0):
+            top = real(1.0)
+            incident += 1
+        x_axis = (axis + 1) % 3
+        y_axis = (axis + 2) % 3
+        j1 = (j + 1) % 3
+        j2 = (j + 2) % 3
+        corners = Polygon()
+        for k in range(4):
+            s1 = real(1.0)
+            s2 = real(1.0)
+            if k == 1 or k == 2:
+                s1 = real(-1.0)
+            if k >= 2:
+                s2 = real(-1.0)
+            v = d + column(rotation, j) * (top * hi[j]) + column(rotation, j1) * (s1 * hi[j1]) + column(rotation, j2) * (s2 * hi[j2])
+            corners = append(corners, v[x_axis], v[y_axis], side * v[axis] - hr[axis], k)
+        corners = clip(corners, 0, hr[x_axis])
+        corners = clip(corners, 1, hr[x_axis])
+        corners = clip(corners, 2, hr[y_axis])
+        corners = clip(corners, 3, hr[y_axis])
+
+        outward = vec3()
+        outward[axis] = side
+        normal = wp.transform_vector(ref, outward)
+        if flip:
+            normal = -normal
+            face += 6
+        for k in range(corners.count):
+            local = vec3()
+            local[x_axis] = corners.x[k]
+            local[y_axis] = corners.y[k]
+            local[axis] = side * (hr[axis] + real(0.5) * corners.z[k])
+            before = corners.edge[(k + corners.count - 1) % corners.count]
+            feature = ((face * 6 + incident) * 8 + before) * 8 + corners.edge[k]
+            write(slots, env, slot + k, wp.transform_point(ref, local), normal, corners.z[k], feature)
+        return corners.count
+
+    @wp.func
+    def edge_contact(slots: Slots, env: int, slot: int, xa: transform, ha: vec3, xb: transform, hb: vec3, rotation: mat33, i: int, j: int):
+        """One point between edge i of a and edge j of b."""
+        d = wp.transform_point(wp.transform_inverse(xa), wp.transform_get_translation(xb))
+        n = edge_axis(rotation, i, j)
+        if wp.dot(n, d) < real(0.0):
+            n = -n
+        feature = 12 * 6 * 64 + (i * 3 + j) * 64
+        pa = vec3()
+        pb = d
+        for k in range(3):
+            if k != i:
+                if n[k] >= real(0.0):
+                    pa[k] = ha[k]
+                    feature += 1 << k
+                else:
+                    pa[k] = -ha[k]
+            if k != j:
+                b_k = column(rotation, k)
+                if wp.dot(n, b_k) <= real(0.0):
+                    pb += b_k * hb[k]
+                    feature += 8 << k
+                else:
+                    pb -= b_k * hb[k]
+        # Where the two lines pass each other.
+        ea = vec3()
+        ea[i] = real(1.0)
+        eb = column(rotation, j)
+        c = wp.dot(ea, eb)
+        offset = pb - pa
+        s = (wp.dot(offset, ea) - c * wp.dot(offset, eb)) / (real(1.0) - c * c)
+        r = (c * wp.dot(offset, ea) - wp.dot(offset, eb)) / (real(1.0) - c * c)
+        qa = pa + ea * wp.clamp(s, -ha[i], ha[i])
+        qb = pb + eb * wp.clamp(r, -hb[j], hb[j])
+        point = wp.transform_point(xa, real(0.5) * (qa + qb))
+        write(slots, env, slot, point, wp.transform_vector(xa, n), wp.dot(n, offset), feature)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def box_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
+        env, index = wp.tid()
+        pair = first + index
+        sa = topology.pairs[pair, 0]
+        sb = topology.pairs[pair, 1]
+        xa = shape_pose(topology, bodies, env, sa)
+        xb = shape_pose(topology, bodies, env, sb)
+        ha = topology.shape_size[sa]
+        hb = topology.shape_size[sb]
+        ca = wp.transform_get_translation(xa)
+        cb = wp.transform_get_translation(xb)
+        slot = topology.pair_slots[pair]
+        count = int(0)
+
+        if wp.length(cb - ca) < reach(topology, bodies, env, sa, ca, h) + reach(topology, bodies, env, sb, cb, h):
+            rotation = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(xa))) * wp.quat_to_matrix(wp.transform_get_rotation(xb))
+            d = wp.transform_point(wp.transform_inverse(xa), cb)
+            db = wp.transpose(rotation) * d
+            # Prefer faces over edges and a over b, so that equal separations do not flip from step to step.
+            bias = real(1.0e-3) * wp.min(wp.min(ha), wp.min(hb))
+            best = face_separation(d, rotation, ha, hb, 0)
+            axis = int(0)
+            for k in range(1, 3):
+                s = face_separation(d, rotation, ha, hb, k)
+                if s > best:
+                    best = s
+                    axis = k
+            best_b = best + bias
+            for k in range(3):
+                s = face_separation(db, wp.transpose(rotation), hb, ha, k)
+                if s > best_b:
+                    best_b = s
+                    best = s
+                    axis = 3 + k
+            best_edge = best + bias
+            for ij in range(9):
+                n = edge_axis(rotation, ij // 3, ij % 3)
+                if wp.dot(n, n) > real(0.0):
+                    s = edge_separation(d, rotation, ha, hb, n)
+                    if s > best_edge:
+                        best_edge = s
+                        axis = 6 + ij
+            if axis < 3:
+                count = face_contacts(slots, env, slot, xa, ha, xb, hb, axis, False)
+            elif axis < 6:
+                count = face_contacts(slots, env, slot, xb, hb, xa, ha, axis - 3, True)
+            else:
+                edge_contact(slots, env, slot, xa, ha, xb, hb, rotation, (axis - 6) // 3, (axis - 6) % 3)
+                count = 1
+        for k in range(count, 8):
+            slots.gap[env, slot + k] = real(NO_POINT)
+
+    return box_box

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the impulses do, and how well they obey the law that was solved: v+, residual, history, status.
+
+Nothing here trusts a solver. From the impulses p = h lambda alone: v+ = v_free + M^-1 J^T p (eq. 24), the relaxed
+contact velocity u~ = J v+ + epsilon p + d (eq. 39), and per contact, with effective masses m = 1 / (W + epsilon),
+
+    normal      r_n = min(u~_n, p_n / m_n)                           [m/s]
+    tangential  r_t = (p_t - P(p_t - m u~_t)) / m                    [m/s]
+
+where P projects on the admissible friction impulses {|e_j . p_t| <= mu_j p_n}: this is the complementarity of eqs.
+36-38 with w_up, w_lo eliminated, and phantom inertia does not appear because w_up w_lo = 0. The residual is the largest
+of them; sum m r^2 / 2 is the unit-consistent energy error E_uc [J].
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .types import FIXED, NOT_A_NUMBER, OPEN, SLIDE, STICK, UNCERTIFIED, scalar_types
+
+
+@functools.cache
+def law(real) -> SimpleNamespace:
+    """The discretised friction law as a projection, for the certificate and for iterative methods."""
+    t = scalar_types(real)
+    vec2 = t.vec2
+
+    @wp.func
+    def project_polygon(x: vec2, apothem: real, k: int) -> vec2:
+        """Nearest point of the regular polygon {|e_j . p| <= apothem}, e_j at angles j pi / k."""
+        step = real(wp.pi) / real(k)
+        angle = step * wp.round(wp.atan2(x[1], x[0]) / step)
+        e = vec2(wp.cos(angle), wp.sin(angle))
+        across = vec2(-e[1], e[0])
+        half_side = apothem * wp.tan(real(0.5) * step)
+        result = x
+        if wp.dot(x, e) > apothem:
+            result = apothem * e + wp.clamp(wp.dot(x, across), -half_side, half_side) * across
+        return result
+
+    @wp.func
+    def project_friction(x: vec2, normal: real, mu: vec2, k: int) -> vec2:
+        """Nearest admissible tangential impulse for the normal impulse."""
+        p_n = wp.max(normal, real(0.0))
+        result = vec2()
+        if k == 2:
+            result = vec2(wp.clamp(x[0], -mu[0] * p_n, mu[0] * p_n), wp.clamp(x[1], -mu[1] * p_n, mu[1] * p_n))
+        elif k > 2:
+            result = project_polygon(x, mu[0] * p_n, k)
+        return result
+
+    return SimpleNamespace(project_friction=project_friction)
+
+
+@functools.cache
+def make(real) -> SimpleNamespace:
+    """Kernels ``certify`` (dim E) and ``integrate`` (dim E, B)."""
+    t = scalar_types(real)
+    vec2, vec3, transform, spatial = t.vec2, t.vec3, t.transform, t.spatial
+    Bodies, Contacts, Slots, Topology = t.Bodies, t.Contacts, t.Slots, t.Topology
+    project_friction = law(real).project_friction
+
+    @wp.func
+    def push(bodies: Bodies, next_velocity: wp.array2d(dtype=spatial), env: int, body: int, point: vec3, impulse: vec3):
+        """Add M^-1 J^T p of one impulse (world axes) to a body's velocity."""
+        if body >= 0 and bodies.inv_mass[env, body] > real(0.0):
+            dv = bodies.inv_mass[env, body] * impulse
+            dw = bodies.inv_inertia[env, body] * wp.cross(point - bodies.com[env, body], impulse)
+            next_velocity[env, body] = next_velocity[env, body] + spatial(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
+
+    @wp.func
+    def change(bodies: Bodies, next_velocity: wp.array2d(dtype=spatial), env: int, body: int, point: vec3) -> vec3:
+        """Velocity that the impulses gave to a body at a point: J (v+ - v_free)."""
+        u = vec3()
+        if body >= 0:
+            twist = next_velocity[env, body] - bodies.free_velocity[env, body]
+            u = wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), point - bodies.com[env, body])
+        return u
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def certify(
+        bodies: Bodies,
+        tolerance: real,
+        final: int,
+        next_velocity: wp.array2d(dtype=spatial),
+        contacts: Contacts,
+        unsolved: wp.array(dtype=int),
+        residual: wp.array(dtype=real),
+        residual_energy: wp.array(dtype=real),
+        status: wp.array(dtype=int),
+    ):
+        env = wp.tid()
+        if unsolved[env] == 0:
+            return
+        r = contacts.count[env]
+        for b in range(next_velocity.shape[1]):
+            next_velocity[env, b] = bodies.free_velocity[env, b]
+        for i in range(r):
+            impulse = wp.transpose(contacts.frame[env, i]) * contacts.impulse[env, i]
+            body = contacts.body[env, i]
+            push(bodies, next_velocity, env, body[0], contacts.point[env, i], -impulse)
+            push(bodies, next_velocity, env, body[1], contacts.point[env, i], impulse)
+
+        worst = real(0.0)
+        energy = real(0.0)
+        finite = bool(True)
+        for b in range(next_velocity.shape[1]):
+            finite = finite and wp.isfinite(next_velocity[env, b])
+        for i in range(r):
+            p = contacts.impulse[env, i]
+            eps = contacts.relaxation[env, i]
+            d = contacts.shift[env, i]
+            body = contacts.body[env, i]
+            point = contacts.point[env, i]
+            du = change(bodies, next_velocity, env, body[1], point) - change(bodies, next_velocity, env, body[0], point)
+            relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
+            mass = wp.cw_div(vec3(real(1.0)), contacts.inv_mass[env, i] + eps)
+            k = contacts.directions[env, i]
+            if k > 2:
+                mass[1] = real(2.0) / (real(1.0) / mass[1] + real(1.0) / mass[2])
+                mass[2] = mass[1]
+            p_t = vec2(p[1], p[2])
+            target = project_friction(p_t - vec2(mass[1] * relaxed[1], mass[2] * relaxed[2]), p[0], contacts.mu[env, i], k)
+            error = vec3(wp.min(relaxed[0], p[0] / mass[0]), (p_t[0] - target[0]) / mass[1], (p_t[1] - target[1]) / mass[2])
+            worst = wp.max(worst, wp.max(wp.abs(error)))
+            energy += real(0.5) * wp.dot(wp.cw_mul(mass, error), error)
+            contacts.velocity[env, i] = relaxed - wp.cw_mul(eps, p) - d
+            state = OPEN
+            if p[0] > real(0.0):
+                state = STICK
+                inside = project_friction(p_t * real(1.0 + 1.0e-9), p[0], contacts.mu[env, i], k) - p_t * real(1.0 + 1.0e-9)
+                if k > 0 and wp.dot(inside, inside) > real(0.0):
+                    state = SLIDE
+            contacts.state[env, i] = state
+
+        residual[env] = worst
+        residual_energy[env] = energy
+        solved = finite and worst <= tolerance
+        if not finite:
+            status[env] = status[env] | NOT_A_NUMBER
+        if solved:
+            unsolved[env] = 0
+        if final != 0 and finite and not solved:
+            status[env] = status[env] | UNCERTIFIED
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def remember(h: real, contacts: Contacts, slots: Slots):
+        """History for the next step: which features touched, with what normal impulse and bristle force."""
+        env = wp.tid()
+        for slot in range(slots.last_feature.shape[1]):
+            slots.last_feature[env, slot] = -1
+        for i in range(contacts.count[env]):
+            slot = contacts.slot[env, i]
+            p = contacts.impulse[env, i]
+            # An unloaded contact is remembered as such; one that never closed will be new when it does.
+            if p[0] > real(0.0) or contacts.gap[env, i] <= real(0.0):
+                u = contacts.velocity[env, i]
+                b_t = contacts.damping[env, i]
+                frame = contacts.frame[env, i]
+                bristle = vec3(real(0.0), p[1] / h + b_t * u[1], p[2] / h + b_t * u[2])
+                slots.last_feature[env, slot] = slots.feature[env, slot]
+                slots.last_impulse[env, slot] = p[0]
+                slots.last_bristle[env, slot] = wp.transpose(frame) * bristle
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def integrate(
+        topology: Topology,
+        bodies: Bodies,
+        next_velocity: wp.array2d(dtype=spatial),
+        h: real,
+        q: wp.array2d(dtype=real),
+        v: wp.array2d(dtype=real),
+    ):
+        """q+ = q + h Gamma(q) v+ (eq. 23): the centre of mass moves straight, the body turns about it."""
+        env, b = wp.tid()
+        if topology.joint_type[b] == FIXED:
+            return
+        i = topology.q_start[b]
+        j = topology.v_start[b]
+        velocity = next_velocity[env, b]
+        pose = bodies.pose[env, b]
+        w = wp.spatial_bottom(velocity)
+        angle = h * wp.length(w)
+        turn = wp.quat_identity(dtype=real)
+        if angle > real(0.0):
+            turn = wp.quat_from_axis_angle(wp.normalize(w), angle)
+        rotation = wp.normalize(turn * wp.transform_get_rotation(pose))
+        com = bodies.com[env, b]
+        offset = wp.quat_rotate(turn, wp.transform_get_translation(pose) - com)
+        pose = transform(com + h * wp.spatial_top(velocity) + offset, rotation)
+        for k in range(7):
+            q[env, i + k] = pose[k]
+        for k in range(6):
+            v[env, j + k] = velocity[k]
+
+    return SimpleNamespace(certify=certify, remember=remember, integrate=integrate)

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From contact points to contact rows: frames, stick or slide, relaxation and bristles (eqs. 34, 40-43).
+
+One thread an environment walks over its slots in order, so the rows always come in the same order. The frame of every
+contact is chosen so that t1 is the direction that matters: the sliding direction while it slides, the direction in
+which it would slip while it sticks. E of eq. 18 is then the same k directions at angles j pi / k for every contact.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .collide import pair_functions
+from .types import FACETS, OVERFLOW, REGULARIZED, scalar_types
+
+# Overlaps are pushed apart no faster than this [m/s], whatever the stiffness.
+MAX_DEPENETRATION_SPEED = wp.constant(3.0)
+# The last normal impulse that eq. 43 divides by is at least this part of the contact's weight.
+IMPULSE_FLOOR = wp.constant(1.0e-2)
+# Table 1 per kilogram of the lighter movable body (warp_lcp.model.TABLE_1), in the order of Parameters.contact.
+TABLE_1 = wp.constant(wp.types.vector(length=5, dtype=wp.float64)(1.0e10, 1.0e8, 1.0e8, 1.0e5, 1.0e-3))
+
+
+@functools.cache
+def row_functions(real) -> SimpleNamespace:
+    """What a contact row is made of; shared with the stages that apply impulses."""
+    t = scalar_types(real)
+    vec3, mat33 = t.vec3, t.mat33
+    Bodies, Parameters = t.Bodies, t.Parameters
+    vec5 = wp.types.vector(length=5, dtype=real)
+
+    @wp.func
+    def point_velocity(velocity: wp.array2d(dtype=t.spatial), com: wp.array2d(dtype=vec3), env: int, body: int, point: vec3) -> vec3:
+        """Velocity of the material point of a body at `point`, world axes; zero for the world (-1)."""
+        u = vec3()
+        if body >= 0:
+            twist = velocity[env, body]
+            u = wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), point - com[env, body])
+        return u
+
+    @wp.func
+    def side_mobility(bodies: Bodies, env: int, body: int, point: vec3) -> mat33:
+        """M^-1 seen at a point: 1/m E - [r] I^-1 [r], world axes; zero for the world."""
+        k = mat33()
+        if body >= 0:
+            r = wp.skew(point - bodies.com[env, body])
+            k = wp.diag(vec3(bodies.inv_mass[env, body])) - r * bodies.inv_inertia[env, body] * r
+        return k
+
+    @wp.func
+    def contact_parameters(parameters: Parameters, bodies: Bodies, env: int, shape_a: int, shape_b: int, body_a: int, body_b: int) -> vec5:
+        """k_n, b_n, k_t, b_t, v_s of a pair: the mean of what its materials author, else Table 1 for the lighter body."""
+        mass = real(0.0)
+        if body_a >= 0 and bodies.inv_mass[env, body_a] > real(0.0):
+            mass = real(1.0) / bodies.inv_mass[env, body_a]
+        if body_b >= 0 and bodies.inv_mass[env, body_b] > real(0.0):
+            mass_b = real(1.0) / bodies.inv_mass[env, body_b]
+            if mass == real(0.0) or mass_b < mass:
+                mass = mass_b
+        row = env % parameters.contact.shape[0]
+        result = vec5()
+        for k in range(5):
+            a = parameters.contact[row, shape_a, k]
+            b = parameters.contact[row, shape_b, k]
+            if wp.isnan(a) and wp.isnan(b):
+                result[k] = real(TABLE_1[k])
+                if k < 4:
+                    result[k] *= mass
+            elif wp.isnan(a):
+                result[k] = b
+            elif wp.isnan(b):
+                result[k] = a
+            else:
+                result[k] = real(0.5) * (a + b)
+        return result
+
+    @wp.func
+    def any_tangent(n: vec3) -> vec3:
+        """World x (or y where the normal is near x) projected on the tangent plane."""
+        axis = vec3(real(1.0), real(0.0), real(0.0))
+        if wp.abs(n[0]) > real(0.9):
+            axis = vec3(real(0.0), real(1.0), real(0.0))
+        return wp.normalize(axis - n * wp.dot(n, axis))
+
+    return SimpleNamespace(
+        point_velocity=point_velocity, side_mobility=side_mobility, contact_parameters=contact_parameters, any_tangent=any_tangent
+    )
+
+
+@functools.cache
+def make(real):
+    """Kernel ``contact_rows``; launch with dim (E)."""
+    t = scalar_types(real)
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
+    f = row_functions(real)
+    point_velocity, side_mobility, contact_parameters, any_tangent = (
+        f.point_velocity,
+        f.side_mobility,
+        f.contact_parameters,
+        f.any_tangent,
+    )
+    shape_pose = pair_functions(real).shape_pose
+
+    @wp.func
+    def surface_velocity(topology: Topology, bodies: Bodies, env: int, shape: int) -> vec3:
+        velocity = topology.surface_velocity[shape]
+        if wp.dot(velocity, velocity) > real(0.0):
+            velocity = wp.transform_vector(shape_pose(topology, bodies, env, shape), velocity)
+        return velocity
+
+    @wp.func
+    def write_row(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        slots: Slots,
+        h: real,
+        sliding: int,
+        directions: int,
+        contacts: Contacts,
+        env: int,
+        slot: int,
+        i: int,
+        u: vec3,
+        u_free: vec3,
+    ):
+        """Row i of an environment from its slot; u and u_free: present and free relative velocity, world axes."""
+        pair = topology.slot_pair[slot]
+        shape_a = topology.pairs[pair, 0]
+        shape_b = topology.pairs[pair, 1]
+        body_a = topology.shape_body[shape_a]
+        body_b = topology.shape_body[shape_b]
+        point = slots.point[env, slot]
+        n = slots.normal[env, slot]
+        phi = slots.gap[env, slot]
+        c = contact_parameters(parameters, bodies, env, shape_a, shape_b, body_a, body_b)
+        k_n = c[0]
+        b_n = c[1]
+        k_t = c[2]
+        b_t = c[3]
+        friction = real(0.5) * (
+            parameters.friction[env % parameters.friction.shape[0], shape_a] + parameters.friction[env % parameters.friction.shape[0], shape_b]
+        )
+        mobility = side_mobility(bodies, env, body_a, point) + side_mobility(bodies, env, body_b, point)
+        w_nn = wp.dot(n, mobility * n)
+        gravity = parameters.gravity[env % parameters.gravity.shape[0]]
+
+        # Normal row. Eqs. 40 and 41 while it overlaps; an open gap only may not close by more than itself.
+        eps_n = real(1.0) / (k_n * h * h + b_n * h)
+        d_n = wp.max(eps_n * h * k_n * phi, -real(MAX_DEPENETRATION_SPEED))
+        if phi > real(0.0):
+            d_n = phi / h
+
+        # History: last normal impulse and bristle force; a new contact starts with its weight and slack bristles.
+        weight = h * wp.length(gravity) / w_nn
+        if weight == real(0.0):
+            weight = wp.abs(wp.dot(n, u_free)) / w_nn
+        impulse = weight
+        bristle = vec3()
+        if slots.last_feature[env, slot] == slots.feature[env, slot]:
+            impulse = slots.last_impulse[env, slot]
+            bristle = slots.last_bristle[env, slot]
+            bristle -= n * wp.dot(n, bristle)
+
+        eps_t = real(1.0) / (k_t * h * h + b_t * h)
+        slip = u - n * wp.dot(n, u)
+        speed = wp.length(slip)
+        slides = speed >= c[4]
+        mu = friction[0]
+        if slides:
+            mu = friction[1]
+        eps = vec3(eps_n, eps_t, eps_t)
+        d_t = -(eps_t * h) * bristle  # eq. 42
+        mu_row = vec2(mu, mu)
+        k = directions
+        t1 = any_tangent(n)
+        if sliding != FACETS:
+            if slides:
+                # Eq. 34, and eq. 43 across the sliding direction.
+                t1 = slip / speed
+                d_t = t1 * wp.dot(t1, d_t)
+                k = 2
+                if sliding == REGULARIZED and mu > real(0.0):
+                    eps[2] = wp.max(eps_t, speed / (mu * wp.max(impulse, real(IMPULSE_FLOOR) * weight)))
+                else:
+                    mu_row[1] = real(0.0)
+            else:
+                # First direction along the slip to come, so that the limit there is mu_s lambda_n exactly.
+                predicted = u_free - n * wp.dot(n, u_free) + d_t
+                length = wp.length(predicted)
+                if length > real(0.0):
+                    t1 = predicted / length
+        elif slides:
+            d_t = vec3()
+        if mu == real(0.0):
+            k = 0
+        t2 = wp.cross(n, t1)
+        frame = wp.matrix_from_rows(n, t1, t2)
+
+        contacts.slot[env, i] = slot
+        contacts.body[env, i] = wp.vec2i(body_a, body_b)
+        contacts.point[env, i] = point
+        contacts.gap[env, i] = phi
+        contacts.frame[env, i] = frame
+        contacts.inv_mass[env, i] = vec3(w_nn, wp.dot(t1, mobility * t1), wp.dot(t2, mobility * t2))
+        contacts.relaxation[env, i] = eps
+        d = vec3(d_n, wp.dot(t1, d_t), wp.dot(t2, d_t))
+        contacts.shift[env, i] = d
+        contacts.free[env, i] = frame * u_free + d
+        contacts.mu[env, i] = mu_row
+        contacts.directions[env, i] = k
+        contacts.damping[env, i] = b_t
+        contacts.impulse[env, i] = vec3()
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def contact_rows(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        slots: Slots,
+        h: real,
+        sliding: int,
+        directions: int,
+        contacts: Contacts,
+        status: wp.array(dtype=int),
+    ):
+        env = wp.tid()
+        gravity = parameters.gravity[env % parameters.gravity.shape[0]]
+        fall = h * h * wp.length(gravity) + real(1.0e-9)
+        count = int(0)
+        for slot in range(slots.gap.shape[1]):
+            phi = slots.gap[env, slot]
+            if phi < real(1.0e29):
+                pair = topology.slot_pair[slot]
+                shape_a = topology.pairs[pair, 0]
+                shape_b = topology.pairs[pair, 1]
+                body_a = topology.shape_body[shape_a]
+                body_b = topology.shape_body[shape_b]
+                point = slots.point[env, slot]
+                belt = surface_velocity(topology, bodies, env, shape_b) - surface_velocity(topology, bodies, env, shape_a)
+                u_free = point_velocity(bodies.free_velocity, bodies.com, env, body_b, point) + belt
+                u_free -= point_velocity(bodies.free_velocity, bodies.com, env, body_a, point)
+                # A row where the gap could close within the step: h times the approach speed, and a margin.
+                if phi < h * wp.max(-wp.dot(slots.normal[env, slot], u_free), real(0.0)) + fall:
+                    if count < contacts.slot.shape[1]:
+                        u = point_velocity(bodies.velocity, bodies.com, env, body_b, point) + belt
+                        u -= point_velocity(bodies.velocity, bodies.com, env, body_a, point)
+                        write_row(
+                            topology, parameters, bodies, slots, h, sliding, directions, contacts, env, slot, count, u, u_free
+                        )
+                        count += 1
+                    else:
+                        status[env] = status[env] | OVERFLOW
+        contacts.count[env] = count
+
+    return contact_rows

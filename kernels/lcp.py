@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's LCP (eqs. 35-39) of one environment: assembly from the contact rows, and the impulses from its solution.
+
+Unknowns of contact i, one after the other: h lambda_n, w_up (k), w_lo (k); their complements: u_n, h sigma_lo,
+h sigma_up. v and h lambda_t are eliminated: with W = J M^-1 J^T + epsilon, b = J v_free + d and A = W_tt,
+
+    h lambda_t = A^-1 (E (w_up - w_lo) - W_tn h lambda_n - b_t).
+
+Contacts without friction have the one unknown h lambda_n and no rows in A.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import lemke as lemke_file
+from .types import scalar_types, sync
+
+
+@functools.cache
+def functions(real) -> SimpleNamespace:
+    """Workspace and the functions ``assemble`` and ``impulses``."""
+    t = scalar_types(real)
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    Bodies, Contacts = t.Bodies, t.Contacts
+    LcpWorkspace = lemke_file.functions(real).LcpWorkspace
+
+    @wp.struct
+    class ContactWorkspace:
+        W: wp.array3d(dtype=real)  # [P, 3 R, 3 R] J M^-1 J^T + epsilon, order n t1 t2 within a contact
+        A_inv: wp.array3d(dtype=real)  # [P, 2 R, 2 R] inverse of W_tt, contacts with friction only
+        G: wp.array3d(dtype=real)  # [P, 2 R, R + 1] A^-1 W_tn; last column A^-1 b_t
+        friction: wp.array2d(dtype=int)  # [P, R + 1] index of the contact within A, -1 = frictionless; last: their number
+        start: wp.array2d(dtype=int)  # [P, R + 1] first unknown of each contact; last: number of unknowns
+
+    @wp.func
+    def arm(bodies: Bodies, contacts: Contacts, env: int, i: int, body: int) -> mat33:
+        """[r] of a contact point about a body's centre of mass."""
+        return wp.skew(contacts.point[env, i] - bodies.com[env, body])
+
+    @wp.func
+    def delassus(bodies: Bodies, contacts: Contacts, env: int, i: int, j: int) -> mat33:
+        """Block (i, j) of J M^-1 J^T, rows and columns n t1 t2."""
+        mobility = mat33()
+        for x in range(2):
+            body = contacts.body[env, i][x]
+            if body >= 0:
+                for y in range(2):
+                    if contacts.body[env, j][y] == body:
+                        block = wp.diag(vec3(bodies.inv_mass[env, body]))
+                        block -= arm(bodies, contacts, env, i, body) * bodies.inv_inertia[env, body] * arm(bodies, contacts, env, j, body)
+                        if x == y:
+                            mobility += block
+                        else:
+                            mobility -= block
+        return contacts.frame[env, i] * mobility * wp.transpose(contacts.frame[env, j])
+
+    @wp.func
+    def direction(k: int, m: int) -> vec2:
+        """e_m, column m of E: angle m pi / k from t1."""
+        angle = real(m) * real(wp.pi) / real(k)
+        e = vec2(wp.cos(angle), wp.sin(angle))
+        if k == 2:
+            e = vec2(real(1 - m), real(m))
+        return e
+
+    @wp.func
+    def invert(a: wp.array3d(dtype=real), slot: int, n: int, lane: int):
+        """Inverse of a symmetric positive definite matrix in place, by sweeping every pivot (Gauss-Jordan)."""
+        for k in range(n):
+            p = real(1.0) / a[slot, k, k]
+            sync()
+            for j in range(lane, n, wp.block_dim()):
+                if j != k:
+                    a[slot, k, j] = p * a[slot, k, j]
+            sync()
+            for i in range(n):
+                if i != k:
+                    f = a[slot, i, k]
+                    for j in range(lane, n, wp.block_dim()):
+                        if j != k:
+                            a[slot, i, j] -= f * a[slot, k, j]
+            sync()
+            for i in range(lane, n, wp.block_dim()):
+                if i != k:
+                    a[slot, i, k] = -p * a[slot, i, k]
+            if lane == 0:
+                a[slot, k, k] = p
+            sync()
+
+    @wp.func
+    def number_unknowns(ws: ContactWorkspace, contacts: Contacts, env: int, slot: int, r: int, lane: int):
+        if lane == 0:
+            unknowns = int(0)
+            frictional = int(0)
+            for i in range(r):
+                k = contacts.directions[env, i]
+                ws.start[slot, i] = unknowns
+                ws.friction[slot, i] = -1
+                unknowns += 1 + 2 * k
+                if k > 0:
+                    ws.friction[slot, i] = frictional
+                    frictional += 1
+            ws.start[slot, r] = unknowns
+            ws.friction[slot, r] = frictional
+        sync()
+
+    @wp.func
+    def eliminate(ws: ContactWorkspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, r: int, lane: int):
+        """W, A^-1 and G."""
+        for ij in range(lane, r * r, wp.block_dim()):
+            i = ij // r
+            j = ij % r
+            block = delassus(bodies, contacts, env, i, j)
+            for a in range(3):
+                if i == j:
+                    block[a, a] += contacts.relaxation[env, i][a]
+                for b in range(3):
+                    ws.W[slot, 3 * i + a, 3 * j + b] = block[a, b]
+            fi = ws.friction[slot, i]
+            fj = ws.friction[slot, j]
+            if fi >= 0 and fj >= 0:
+                for a in range(2):
+                    for b in range(2):
+                        ws.A_inv[slot, 2 * fi + a, 2 * fj + b] = block[1 + a, 1 + b]
+        sync()
+        frictional = ws.friction[slot, r]
+        invert(ws.A_inv, slot, 2 * frictional, lane)
+        for row in range(lane, 2 * frictional, wp.block_dim()):
+            for j in range(r + 1):
+                total = real(0.0)
+                for i in range(r):
+                    fi = ws.friction[slot, i]
+                    if fi >= 0:
+                        for a in range(2):
+                            right = contacts.free[env, i][1 + a]
+                            if j < r:
+                                right = ws.W[slot, 3 * i + 1 + a, 3 * j]
+                            total += ws.A_inv[slot, row, 2 * fi + a] * right
+                ws.G[slot, row, j] = total
+        sync()
+
+    @wp.func
+    def assemble(
+        lcp: LcpWorkspace, ws: ContactWorkspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, rho_scale: real, lane: int
+    ) -> int:
+        """Lead matrix and vector of eq. 35 after elimination, in lcp.M and lcp.q; returns the number of unknowns."""
+        r = contacts.count[env]
+        number_unknowns(ws, contacts, env, slot, r, lane)
+        eliminate(ws, bodies, contacts, env, slot, r, lane)
+        for ij in range(lane, r * r, wp.block_dim()):
+            i = ij // r
+            j = ij % r
+            si = ws.start[slot, i]
+            sj = ws.start[slot, j]
+            fi = ws.friction[slot, i]
+            fj = ws.friction[slot, j]
+            ki = contacts.directions[env, i]
+            kj = contacts.directions[env, j]
+            # u_n = (W_nn - W_nt A^-1 W_tn) h lambda_n + W_nt A^-1 E (w_up - w_lo) + b_n - W_nt A^-1 b_t
+            nn = ws.W[slot, 3 * i, 3 * j]
+            for c in range(r):
+                fc = ws.friction[slot, c]
+                if fc >= 0:
+                    for a in range(2):
+                        nn -= ws.W[slot, 3 * i, 3 * c + 1 + a] * ws.G[slot, 2 * fc + a, j]
+            lcp.M[slot, si, sj] = nn
+            for m in range(kj):
+                e = direction(kj, m)
+                g = ws.G[slot, 2 * fj, i] * e[0] + ws.G[slot, 2 * fj + 1, i] * e[1]
+                lcp.M[slot, si, sj + 1 + m] = g
+                lcp.M[slot, si, sj + 1 + kj + m] = -g
+            # h sigma_lo,up = mu h lambda_n +- E^T h lambda_t + rho w_lo,up   (eqs. 29 and 30)
+            for m in range(ki):
+                e = direction(ki, m)
+                g = ws.G[slot, 2 * fi, j] * e[0] + ws.G[slot, 2 * fi + 1, j] * e[1]
+                mu = real(0.0)
+                if i == j:
+                    mu = contacts.mu[env, i][wp.min(m, 1)]
+                lcp.M[slot, si + 1 + m, sj] = mu - g
+                lcp.M[slot, si + 1 + ki + m, sj] = mu + g
+                for l in range(kj):
+                    f = direction(kj, l)
+                    k_ml = real(0.0)
+                    for a in range(2):
+                        for b in range(2):
+                            k_ml += e[a] * ws.A_inv[slot, 2 * fi + a, 2 * fj + b] * f[b]
+                    rho = real(0.0)
+                    if i == j and l == m:
+                        rho = rho_scale * k_ml
+                    lcp.M[slot, si + 1 + m, sj + 1 + l] = k_ml
+                    lcp.M[slot, si + 1 + m, sj + 1 + kj + l] = rho - k_ml
+                    lcp.M[slot, si + 1 + ki + m, sj + 1 + l] = rho - k_ml
+                    lcp.M[slot, si + 1 + ki + m, sj + 1 + kj + l] = k_ml
+        for i in range(lane, r, wp.block_dim()):
+            si = ws.start[slot, i]
+            fi = ws.friction[slot, i]
+            ki = contacts.directions[env, i]
+            b_n = contacts.free[env, i][0]
+            for c in range(r):
+                fc = ws.friction[slot, c]
+                if fc >= 0:
+                    for a in range(2):
+                        b_n -= ws.W[slot, 3 * i, 3 * c + 1 + a] * ws.G[slot, 2 * fc + a, r]
+            lcp.q[slot, si] = b_n
+            for m in range(ki):
+                e = direction(ki, m)
+                g = ws.G[slot, 2 * fi, r] * e[0] + ws.G[slot, 2 * fi + 1, r] * e[1]
+                lcp.q[slot, si + 1 + m] = -g
+                lcp.q[slot, si + 1 + ki + m] = g
+        sync()
+        return ws.start[slot, r]
+
+    @wp.func
+    def impulses(lcp: LcpWorkspace, ws: ContactWorkspace, contacts: Contacts, env: int, slot: int, lane: int):
+        """h lambda of every contact from the solution in lcp.z."""
+        r = contacts.count[env]
+        for i in range(lane, r, wp.block_dim()):
+            p = vec3(lcp.z[slot, ws.start[slot, i]], real(0.0), real(0.0))
+            fi = ws.friction[slot, i]
+            if fi >= 0:
+                for a in range(2):
+                    total = -ws.G[slot, 2 * fi + a, r]
+                    for j in range(r):
+                        sj = ws.start[slot, j]
+                        total -= ws.G[slot, 2 * fi + a, j] * lcp.z[slot, sj]
+                        fj = ws.friction[slot, j]
+                        kj = contacts.directions[env, j]
+                        for m in range(kj):
+                            e = direction(kj, m)
+                            w = lcp.z[slot, sj + 1 + m] - lcp.z[slot, sj + 1 + kj + m]
+                            total += (ws.A_inv[slot, 2 * fi + a, 2 * fj] * e[0] + ws.A_inv[slot, 2 * fi + a, 2 * fj + 1] * e[1]) * w
+                    p[1 + a] = total
+            contacts.impulse[env, i] = p
+        sync()
+
+    return SimpleNamespace(ContactWorkspace=ContactWorkspace, assemble=assemble, impulses=impulses, direction=direction)
+
+
+@functools.cache
+def make(real):
+    """Kernel ``lemke_contacts``; launch tiled with dim (P): workspace P serves the environments P, P + num, ..."""
+    t = scalar_types(real)
+    Bodies, Contacts = t.Bodies, t.Contacts
+    f = functions(real)
+    ContactWorkspace, assemble, impulses = f.ContactWorkspace, f.assemble, f.impulses
+    g = lemke_file.functions(real)
+    LcpWorkspace, lemke = g.LcpWorkspace, g.lemke
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def lemke_contacts(
+        bodies: Bodies,
+        contacts: Contacts,
+        unsolved: wp.array(dtype=int),
+        rho_scale: real,
+        lcp: LcpWorkspace,
+        ws: ContactWorkspace,
+        iterations: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+    ):
+        slot, lane = wp.tid()
+        for env in range(slot, contacts.count.shape[0], lcp.q.shape[0]):
+            if unsolved[env] != 0 and contacts.count[env] > 0:
+                n = assemble(lcp, ws, bodies, contacts, env, slot, rho_scale, lane)
+                result = lemke(lcp, slot, n, 10 * n + 100, lane)
+                impulses(lcp, ws, contacts, env, slot, lane)
+                if lane == 0:
+                    iterations[env] = iterations[env] + result[1]
+                    status[env] = status[env] | result[0]
+                sync()
+
+    return lemke_contacts

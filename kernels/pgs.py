@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Block projected Gauss-Seidel on contact blocks (p_n, p_t), in velocities: neither W nor the LCP is formed.
+
+Sweep after sweep each contact corrects its own impulse for the present v, normal first, then the friction projected on
+what the new normal impulse admits, and v takes the change at once. Cold started: a warm start makes the answer depend
+on history where contacts are redundant.
+"""
+
+import functools
+
+import warp as wp
+
+from .certify import law
+from .types import ITERATION_LIMIT, scalar_types
+
+
+@functools.cache
+def make(real):
+    """Kernel ``pgs``; launch with dim (E)."""
+    t = scalar_types(real)
+    vec2, vec3, spatial = t.vec2, t.vec3, t.spatial
+    Bodies, Contacts = t.Bodies, t.Contacts
+    project_friction = law(real).project_friction
+
+    @wp.func
+    def relative(bodies: Bodies, velocity: wp.array2d(dtype=spatial), env: int, body: wp.vec2i, point: vec3) -> vec3:
+        """J (v - v_free) at a contact, world axes."""
+        u = vec3()
+        for side in range(2):
+            b = body[side]
+            if b >= 0:
+                twist = velocity[env, b] - bodies.free_velocity[env, b]
+                u_b = wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), point - bodies.com[env, b])
+                if side == 0:
+                    u -= u_b
+                else:
+                    u += u_b
+        return u
+
+    @wp.func
+    def apply(bodies: Bodies, velocity: wp.array2d(dtype=spatial), env: int, body: wp.vec2i, point: vec3, impulse: vec3):
+        """v += M^-1 J^T p for one impulse, world axes."""
+        for side in range(2):
+            b = body[side]
+            if b >= 0 and bodies.inv_mass[env, b] > real(0.0):
+                p = impulse
+                if side == 0:
+                    p = -impulse
+                dv = bodies.inv_mass[env, b] * p
+                dw = bodies.inv_inertia[env, b] * wp.cross(point - bodies.com[env, b], p)
+                velocity[env, b] = velocity[env, b] + spatial(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pgs(
+        bodies: Bodies,
+        contacts: Contacts,
+        sweeps: int,
+        tolerance: real,
+        velocity: wp.array2d(dtype=spatial),
+        iterations: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+    ):
+        env = wp.tid()
+        r = contacts.count[env]
+        for b in range(velocity.shape[1]):
+            velocity[env, b] = bodies.free_velocity[env, b]
+        change = real(0.0)
+        sweep = int(0)
+        searching = r > 0
+        while searching:
+            change = real(0.0)
+            for i in range(r):
+                body = contacts.body[env, i]
+                point = contacts.point[env, i]
+                frame = contacts.frame[env, i]
+                eps = contacts.relaxation[env, i]
+                diagonal = contacts.inv_mass[env, i] + eps
+                free = contacts.free[env, i]
+                p = contacts.impulse[env, i]
+                old = p
+
+                relaxed = free + frame * relative(bodies, velocity, env, body, point) + wp.cw_mul(eps, p)
+                p[0] = wp.max(p[0] - relaxed[0] / diagonal[0], real(0.0))
+                apply(bodies, velocity, env, body, point, frame[0] * (p[0] - old[0]))
+                k = contacts.directions[env, i]
+                if k > 0:
+                    relaxed = free + frame * relative(bodies, velocity, env, body, point) + wp.cw_mul(eps, p)
+                    x = vec2(p[1] - relaxed[1] / diagonal[1], p[2] - relaxed[2] / diagonal[2])
+                    x = project_friction(x, p[0], contacts.mu[env, i], k)
+                    p = vec3(p[0], x[0], x[1])
+                    apply(bodies, velocity, env, body, point, frame[1] * (p[1] - old[1]) + frame[2] * (p[2] - old[2]))
+                contacts.impulse[env, i] = p
+                change = wp.max(change, wp.max(wp.abs(wp.cw_mul(diagonal, p - old))))
+            sweep += 1
+            searching = change > tolerance and sweep < sweeps
+        iterations[env] = iterations[env] + sweep
+        if change > tolerance:
+            status[env] = status[env] | ITERATION_LIMIT
+
+    return pgs

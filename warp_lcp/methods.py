@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Solution methods of the contact problem. A method sees one problem, the rows of every environment, and leaves impulses.
+
+A new method is a class with ``prepare`` (allocate, once) and ``launch`` (record its kernels, no host read-back), entered
+in METHODS.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from .kernels import lcp, lemke, pgs
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+#: Blocks that solve LCPs at one time on a GPU: enough to fill the largest, each with its own workspace.
+GPU_WORKSPACES = 2048
+#: Lanes of such a block.
+LANES = 32
+
+
+def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
+    """Workspace of `slots` problems of at most n unknowns for the Lemke kernels."""
+    ws = lemke.functions(real).LcpWorkspace()
+    ws.M = wp.empty((slots, n, n), dtype=real, device=device)
+    ws.q = wp.empty((slots, n), dtype=real, device=device)
+    ws.z = wp.empty((slots, n), dtype=real, device=device)
+    ws.tableau = wp.empty((slots, n, n + 2), dtype=real, device=device)
+    ws.scale = wp.empty((slots, n), dtype=real, device=device)
+    ws.basic = wp.empty((slots, n), dtype=int, device=device)
+    ws.nonbasic = wp.empty((slots, n + 1), dtype=int, device=device)
+    return ws
+
+
+def workspaces(num_envs: int, device: wp.Device) -> int:
+    """Problems worked on at one time: one on the CPU, where it stays in the cache."""
+    return 1 if device.is_cpu else min(num_envs, GPU_WORKSPACES)
+
+
+class Lemke:
+    """Lemke's method on the assembled LCP of eq. 39, no fallback."""
+
+    def prepare(self, sim: Simulator) -> None:
+        r, real = sim.model.max_contacts, sim.real
+        slots = workspaces(sim.num_envs, sim.device)
+        self.kernel = lcp.make(real)
+        self.lcp = lcp_workspace(real, slots, r * (1 + 2 * sim.directions), sim.device)
+        ws = lcp.functions(real).ContactWorkspace()
+        ws.W = wp.empty((slots, 3 * r, 3 * r), dtype=real, device=sim.device)
+        ws.A_inv = wp.empty((slots, 2 * r, 2 * r), dtype=real, device=sim.device)
+        ws.G = wp.empty((slots, 2 * r, r + 1), dtype=real, device=sim.device)
+        ws.friction = wp.empty((slots, r + 1), dtype=int, device=sim.device)
+        ws.start = wp.empty((slots, r + 1), dtype=int, device=sim.device)
+        self.contacts = ws
+        self.slots = slots
+
+    def launch(self, sim: Simulator) -> None:
+        inputs = [sim.bodies, sim.rows, sim.unsolved, sim.rho_scale, self.lcp, self.contacts, sim.iterations, sim.status]
+        wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
+
+
+class BlockPGS:
+    """Block projected Gauss-Seidel: a fixed number of cold sweeps, fewer where it converges."""
+
+    SWEEPS = 50
+
+    def prepare(self, sim: Simulator) -> None:
+        self.kernel = pgs.make(sim.real)
+
+    def launch(self, sim: Simulator) -> None:
+        # Sweeps end where no impulse changes a velocity by more than a hundredth of what certifies an answer.
+        inputs = [sim.bodies, sim.rows, self.SWEEPS, 0.01 * sim.tolerance, sim.next_velocity, sim.iterations, sim.status]
+        wp.launch(self.kernel, dim=sim.num_envs, inputs=inputs, device=sim.device)
+
+
+#: Methods in the order in which they are tried, by the name that users give.
+METHODS: dict[str, tuple[type, ...]] = {
+    "auto": (Lemke,),
+    "lemke": (Lemke,),
+    "pgs": (BlockPGS,),
+}

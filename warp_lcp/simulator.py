@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Simulator: many environments of one Model, advanced together."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from .errors import WarpLcpError
+from .kernels import bodies, box_box, certify, collide, contacts
+from .kernels.types import scalar_types
+from .methods import METHODS
+from .model import Model, ShapeType
+
+SLIDING = ("regularized", "aligned", "facets")
+PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.float32)}
+#: Largest residual [m/s] of an answer that counts as solved.
+TOLERANCE = 1e-6
+
+
+class Status(enum.IntFlag):
+    """Bits of an environment's status word; OK is zero."""
+
+    OK = 0
+    ITERATION_LIMIT = 1  #: the method stopped before it was done
+    RAY = 2  #: Lemke's method ended on a ray
+    NOT_A_NUMBER = 4  #: the state holds a NaN or an infinity
+    OVERFLOW = 8  #: more contacts than Model.max_contacts; those that came last were dropped
+    UNCERTIFIED = 16  #: the answer's residual exceeds 1e-6 m/s; it was applied all the same
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Contacts of the last step, at its start position. E environments, R = Model.max_contacts.
+
+    Entries from ``count`` on are stale.
+
+    Attributes:
+        count: [E] contacts in each environment.
+        bodies: [E, R] vec2i, bodies a and b; -1 = the world.
+        point: [E, R] vec3, world, half-way across the gap, m.
+        gap: [E, R] phi, m.
+        frame: [E, R] mat33, rows n (from a to b), t1, t2 in world axes.
+        impulse: [E, R] vec3 on b, along n, t1, t2, N s.
+        velocity: [E, R] vec3 of b relative to a at the end of the step, along n, t1, t2, m/s.
+        state: [E, R] 0 open, 1 stick, 2 slide.
+    """
+
+    count: wp.array
+    bodies: wp.array
+    point: wp.array
+    gap: wp.array
+    frame: wp.array
+    impulse: wp.array
+    velocity: wp.array
+    state: wp.array
+
+
+class Simulator:
+    """N environments of one Model.
+
+    Args:
+        model: the scene.
+        num_envs: number of environments E.
+        dt: step size h [s].
+        formulation: contact law, see docs/theory.md.
+        method: how the contact problem is solved: 'auto', 'lemke' or 'pgs'.
+        sliding: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes throughout).
+        directions: k, friction directions of a sticking contact, at least 2.
+        rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
+        precision: 'float64' or 'float32', of state and solution.
+        integrator: 'euler', q+ = q + h Gamma v+ (eq. 23).
+        device: Warp device; None = Warp's default.
+        strict: raise after a step in which an environment's status is not OK (reads the status back every time).
+
+    Attributes:
+        q, v: [E, nq], [E, nv] state, writable in place.
+        q0, v0: the state that :meth:`reset` copies back, writable.
+        wrench: [E, B] spatial vector, force [N] and torque [N m] at the centre of mass, world axes; stays until changed.
+        status: [E] :class:`Status` bits of the last step() call, or-ed over its steps.
+        residual: [E] m/s, largest violation of the law that was solved, of the last step.
+        residual_energy: [E] J, unit-consistent energy error of the last step.
+        iterations: [E] pivots or sweeps of the last step() call.
+
+    Raises:
+        WarpLcpError: for an argument outside its range.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        num_envs: int = 1,
+        dt: float = 1e-3,
+        formulation: str = "phantom_inertia",
+        method: str = "auto",
+        *,
+        sliding: str = "regularized",
+        directions: int = 2,
+        rho_scale: float = 1.0,
+        precision: str = "float64",
+        integrator: str = "euler",
+        device: Any = None,
+        strict: bool = False,
+    ):
+        _choice("formulation", formulation, ("phantom_inertia",))
+        _choice("method", method, tuple(METHODS))
+        _choice("sliding", sliding, SLIDING)
+        _choice("precision", precision, tuple(PRECISIONS))
+        _choice("integrator", integrator, ("euler",))
+        if int(num_envs) != num_envs or num_envs < 1:
+            raise WarpLcpError(f"num_envs is {num_envs}; give a whole number of at least 1")
+        if int(directions) != directions or directions < 2:
+            raise WarpLcpError(f"directions is {directions}; give a whole number of at least 2")
+        if not (np.isfinite(dt) and dt > 0.0):
+            raise WarpLcpError(f"dt is {dt} s; it must be finite and greater than zero")
+        if not (np.isfinite(rho_scale) and rho_scale > 0.0):
+            raise WarpLcpError(f"rho_scale is {rho_scale}; it must be finite and greater than zero")
+        self.model, self.num_envs, self.dt = model, int(num_envs), float(dt)
+        self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
+        self.directions, self.rho_scale, self.strict = int(directions), float(rho_scale), bool(strict)
+        self.device = wp.get_device(device)
+        self.real, self._numpy_real = PRECISIONS[precision]
+        self.tolerance = TOLERANCE
+        self._types = scalar_types(self.real)
+        self._allocate()
+        self._load_kernels()
+        self._graph: Any = None
+        self.time = 0.0
+
+    # ---------------------------------------------------------------------------------------------------- stepping
+
+    def step(self, count: int = 1) -> None:
+        """Advance every environment by ``count`` steps."""
+        if self._graph is None:
+            self._record()
+        self.status.zero_()
+        self.iterations.zero_()
+        for _ in range(count):
+            wp.capture_launch(self._graph)
+        self.time += count * self.dt
+        if self.strict:
+            self._raise_for_status()
+
+    def reset(self, mask: Any = None) -> None:
+        """Copy q0, v0 back and clear every hidden buffer (contact history, applied wrenches, status).
+
+        Args:
+            mask: [E] bool, environments to reset, numpy or Warp; None = all.
+        """
+        if mask is None:
+            mask = np.ones(self.num_envs, dtype=bool)
+        if not isinstance(mask, wp.array):
+            mask = np.asarray(mask, dtype=bool)
+            if mask.shape != (self.num_envs,):
+                raise WarpLcpError(f"reset: mask has shape {mask.shape}; give ({self.num_envs},), one bool an environment")
+            mask = wp.array(mask, dtype=wp.bool, device=self.device)
+        raise NotImplementedError
+
+    def _step_kernels(self) -> None:
+        """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back."""
+        k, e, h, dev = self._kernels, self.num_envs, self.dt, self.device
+        body_dim = (e, self.model.num_bodies)
+        wp.launch(k.kinematics, dim=body_dim, inputs=[self.q, self.v, self.topology, self.bodies], device=dev)
+        wp.launch(k.free_motion, dim=body_dim, inputs=[self.topology, self.parameters, self.wrench, h, self.bodies], device=dev)
+        for kernel, first, number, extra in self._pair_kernels:
+            wp.launch(kernel, dim=(e, number), inputs=[self.topology, self.bodies, first, *extra, self.slots], device=dev)
+        self.unsolved.fill_(1)
+        sliding = SLIDING.index(self.sliding)
+        rows = [self.topology, self.parameters, self.bodies, self.slots, h, sliding, self.directions, self.rows, self.status]
+        wp.launch(k.contact_rows, dim=e, inputs=rows, device=dev)
+        for i, method in enumerate(self._methods):
+            method.launch(self)
+            wp.launch(
+                k.certify,
+                dim=e,
+                inputs=[self.bodies, self.tolerance, int(i + 1 == len(self._methods)), self.next_velocity, self.rows]
+                + [self.unsolved, self.residual, self.residual_energy, self.status],
+                device=dev,
+            )
+        wp.launch(k.remember, dim=e, inputs=[h, self.rows, self.slots], device=dev)
+        wp.launch(k.integrate, dim=body_dim, inputs=[self.topology, self.bodies, self.next_velocity, h, self.q, self.v], device=dev)
+        wp.launch(k.kinematics, dim=body_dim, inputs=[self.q, self.v, self.topology, self.bodies], device=dev)
+
+    def _record(self) -> None:
+        with wp.ScopedCapture(device=self.device) as capture:
+            self._step_kernels()
+        self._graph = capture.graph
+
+    # --------------------------------------------------------------------------------------------------- allocation
+
+    def _array(self, n: int, dtype: Any) -> wp.array:
+        """Zeroed array [E, n]: rows together on the CPU, environments together on a GPU (coalesced)."""
+        if self.device.is_cpu:
+            return wp.zeros((self.num_envs, n), dtype=dtype, device=self.device)
+        return wp.zeros((n, self.num_envs), dtype=dtype, device=self.device).transpose()
+
+    def _constant(self, values: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, dtype=self._numpy_real), dtype=dtype, device=self.device)
+
+    def _allocate(self) -> None:
+        t, m, e = self._types, self.model, self.num_envs
+        b, c, r = m.num_bodies, m.num_slots, m.max_contacts
+        ints = lambda x: wp.array(np.ascontiguousarray(x, dtype=np.int32), dtype=int, device=self.device)
+
+        topology = self.topology = t.Topology()
+        topology.joint_type, topology.q_start, topology.v_start = ints(m.joint_type), ints(m.q_start), ints(m.v_start)
+        topology.joint_pose = self._constant(m.joint_pose, t.transform)
+        topology.shape_body = ints(m.shape_body)
+        topology.shape_pose = self._constant(m.shape_pose, t.transform)
+        topology.shape_size = self._constant(m.shape_size, t.vec3)
+        topology.surface_velocity = self._constant(m.shape_surface_velocity, t.vec3)
+        topology.pairs, topology.pair_slots = ints(m.pairs), ints(m.pair_slots)
+        topology.slot_pair = ints(np.repeat(np.arange(len(m.pairs)), np.diff(m.pair_slots)))
+
+        parameters = self.parameters = t.Parameters()
+        parameters.mass = self._constant(m.mass[None], self.real)
+        parameters.inertia = self._constant(m.inertia[None], t.mat33)
+        parameters.com = self._constant(m.com[None], t.vec3)
+        parameters.friction = self._constant(m.friction[None], t.vec2)
+        parameters.contact = self._constant(m.contact[None], self.real)
+        parameters.gravity = self._constant(m.gravity[None], t.vec3)
+
+        bundle = self.bodies = t.Bodies()
+        bundle.pose, bundle.velocity = self._array(b, t.transform), self._array(b, t.spatial)
+        bundle.com, bundle.inv_mass, bundle.inv_inertia = self._array(b, t.vec3), self._array(b, self.real), self._array(b, t.mat33)
+        bundle.free_velocity = self._array(b, t.spatial)
+        self.next_velocity = self._array(b, t.spatial)
+
+        slots = self.slots = t.Slots()
+        slots.point, slots.normal = self._array(c, t.vec3), self._array(c, t.vec3)
+        slots.gap, slots.feature = self._array(c, self.real), self._array(c, int)
+        slots.last_feature, slots.last_impulse = self._array(c, int), self._array(c, self.real)
+        slots.last_bristle = self._array(c, t.vec3)
+        slots.last_feature.fill_(-1)
+
+        rows = self.rows = t.Contacts()
+        rows.count = wp.zeros(e, dtype=int, device=self.device)
+        rows.slot, rows.body, rows.state, rows.directions = (self._array(r, d) for d in (int, wp.vec2i, int, int))
+        rows.point, rows.inv_mass, rows.relaxation, rows.shift, rows.free, rows.impulse, rows.velocity = (
+            self._array(r, t.vec3) for _ in range(7)
+        )
+        rows.gap, rows.damping = self._array(r, self.real), self._array(r, self.real)
+        rows.frame, rows.mu = self._array(r, t.mat33), self._array(r, t.vec2)
+
+        self.q, self.q0 = self._array(m.nq, self.real), self._array(m.nq, self.real)
+        self.v, self.v0 = self._array(m.nv, self.real), self._array(m.nv, self.real)
+        for array, values in ((self.q, m.q0), (self.q0, m.q0), (self.v, m.v0), (self.v0, m.v0)):
+            array.assign(np.tile(values.astype(self._numpy_real), (e, 1)))
+        self.wrench = self._array(b, t.spatial)
+        self.status, self.iterations, self.unsolved = (wp.zeros(e, dtype=int, device=self.device) for _ in range(3))
+        self.residual, self.residual_energy = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(2))
+
+    def _load_kernels(self) -> None:
+        from types import SimpleNamespace
+
+        real, m = self.real, self.model
+        body, cert = bodies.make(real), certify.make(real)
+        self._kernels = SimpleNamespace(
+            kinematics=body.kinematics,
+            free_motion=body.free_motion,
+            contact_rows=contacts.make(real),
+            certify=cert.certify,
+            remember=cert.remember,
+            integrate=cert.integrate,
+        )
+        self._pair_kernels: list[tuple[Any, int, int, tuple]] = []
+        kinds = [tuple(ShapeType(m.shape_type[s]).name for s in pair) for pair in m.pairs]
+        for kind in dict.fromkeys(kinds):
+            first, number = kinds.index(kind), kinds.count(kind)
+            if kind == ("BOX", "BOX"):
+                self._pair_kernels.append((box_box.make(real), first, number, (self.dt,)))
+            else:
+                self._pair_kernels.append((collide.make(real)[kind], first, number, ()))
+        self._methods = [method() for method in METHODS[self.method]]
+        for method in self._methods:
+            method.prepare(self)
+
+
+def _choice(what: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise WarpLcpError(f"{what} is {value!r}; choose one of {', '.join(choices)}")
