@@ -154,7 +154,7 @@ def make(real) -> SimpleNamespace:
             slot = contacts.slot[env, i]
             p = contacts.impulse[env, i]
             # An unloaded contact is remembered as such; one that never closed will be new when it does.
-            if p[0] > real(0.0) or contacts.gap[env, i] <= real(0.0):
+            if p[0] > real(0.0) or contacts.closed[env, i] != 0:
                 u = contacts.velocity[env, i]
                 b_t = contacts.damping[env, i]
                 frame = contacts.frame[env, i]

@@ -16,6 +16,8 @@ from .types import FACETS, OVERFLOW, REGULARIZED, scalar_types
 
 # Overlaps are pushed apart no faster than this [m/s], whatever the stiffness.
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
+# A contact that opens by more than this many static deflections under its weight has separated.
+ELASTIC_RANGE = wp.constant(10.0)
 # The last normal impulse that eq. 43 divides by is at least this part of the contact's weight.
 IMPULSE_FLOOR = wp.constant(1.0e-2)
 # Table 1 per kilogram of the lighter movable body (warp_lcp.model.TABLE_1), in the order of Parameters.contact.
@@ -147,22 +149,27 @@ def make(real):
         w_nn = wp.dot(n, mobility * n)
         gravity = parameters.gravity[env % parameters.gravity.shape[0]]
 
-        # Normal row. Eqs. 40 and 41 while it overlaps; an open gap only may not close by more than itself.
-        eps_n = real(1.0) / (k_n * h * h + b_n * h)
-        d_n = wp.max(eps_n * h * k_n * phi, -real(MAX_DEPENETRATION_SPEED))
-        if phi > real(0.0):
-            d_n = phi / h
-
         # History: last normal impulse and bristle force; a new contact starts with its weight and slack bristles.
         weight = h * wp.length(gravity) / w_nn
         if weight == real(0.0):
             weight = wp.abs(wp.dot(n, u_free)) / w_nn
         impulse = weight
         bristle = vec3()
-        if slots.last_feature[env, slot] == slots.feature[env, slot]:
+        touched = slots.last_feature[env, slot] == slots.feature[env, slot]
+        if touched:
             impulse = slots.last_impulse[env, slot]
             bristle = slots.last_bristle[env, slot]
             bristle -= n * wp.dot(n, bristle)
+
+        # Normal row. Eqs. 40 and 41 while the surfaces touch; an open gap only may not close by more than itself.
+        # Compliance moves surfaces in contact apart and together by the deflection under their load, so one that
+        # touched stays in contact within that range: there an unloaded point carries on with the same law as the
+        # loaded ones beside it, which is what makes redundant normal forces unique.
+        eps_n = real(1.0) / (k_n * h * h + b_n * h)
+        closed = phi <= real(0.0) or (touched and phi * k_n * h <= real(ELASTIC_RANGE) * weight)
+        d_n = phi / h
+        if closed:
+            d_n = wp.max(eps_n * h * k_n * phi, -real(MAX_DEPENETRATION_SPEED))
 
         eps_t = real(1.0) / (k_t * h * h + b_t * h)
         slip = u - n * wp.dot(n, u)
@@ -203,6 +210,7 @@ def make(real):
         contacts.body[env, i] = wp.vec2i(body_a, body_b)
         contacts.point[env, i] = point
         contacts.gap[env, i] = phi
+        contacts.closed[env, i] = int(closed)
         contacts.frame[env, i] = frame
         contacts.inv_mass[env, i] = vec3(w_nn, wp.dot(t1, mobility * t1), wp.dot(t2, mobility * t2))
         contacts.relaxation[env, i] = eps

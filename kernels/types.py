@@ -97,6 +97,7 @@ def scalar_types(real) -> SimpleNamespace:
         body: wp.array2d(dtype=wp.vec2i)  # [E, R] a, b; -1 = world
         point: wp.array2d(dtype=vec3)  # [E, R] world
         gap: wp.array2d(dtype=real)  # [E, R]
+        closed: wp.array2d(dtype=int)  # [E, R] 1 where the surfaces touch, 0 where a gap may close within the step
         frame: wp.array2d(dtype=mat33)  # [E, R] rows n, t1, t2
         inv_mass: wp.array2d(dtype=vec3)  # [E, R] diagonal of W = J M^-1 J^T, 1/kg
         relaxation: wp.array2d(dtype=vec3)  # [E, R] epsilon, 1/kg

@@ -239,7 +239,8 @@ class Simulator:
 
         rows = self.rows = t.Contacts()
         rows.count = wp.zeros(e, dtype=int, device=self.device)
-        rows.slot, rows.body, rows.state, rows.directions = (self._array(r, d) for d in (int, wp.vec2i, int, int))
+        rows.body = self._array(r, wp.vec2i)
+        rows.slot, rows.closed, rows.state, rows.directions = (self._array(r, int) for _ in range(4))
         rows.point, rows.inv_mass, rows.relaxation, rows.shift, rows.free, rows.impulse, rows.velocity = (
             self._array(r, t.vec3) for _ in range(7)
         )

@@ -160,13 +160,15 @@ def read_usd(scene: Any, *, meters_per_unit: float | None = None) -> SceneReadin
 
 def _import_pxr() -> SimpleNamespace:
     try:
-        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdUtils
+        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdUtils
     except ImportError as error:
         raise MissingExtra("reading USD scenes", "usd", error) from error
     parse = getattr(UsdPhysics, "UsdPhysicsLoadStageFromPrimRange", None) or getattr(UsdPhysics, "LoadUsdPhysicsFromRange", None)
     if parse is None:
         raise MissingExtra("reading USD scenes", "usd", ImportError("the installed pxr has no UsdPhysics parser, it is too old"))
-    return SimpleNamespace(Gf=Gf, Sdf=Sdf, Tf=Tf, Usd=Usd, UsdGeom=UsdGeom, UsdPhysics=UsdPhysics, UsdUtils=UsdUtils, parse=parse)
+    return SimpleNamespace(
+        Gf=Gf, Sdf=Sdf, Tf=Tf, Usd=Usd, UsdGeom=UsdGeom, UsdPhysics=UsdPhysics, UsdShade=UsdShade, UsdUtils=UsdUtils, parse=parse
+    )
 
 
 def _open(px: SimpleNamespace, scene: Any) -> tuple[Any, str]:
@@ -376,14 +378,14 @@ class _Reader:
         """[3] m/s^2 of the first Scene."""
         if not self.scenes:
             self.notes.append(f"no PhysicsScene prim: gravity 9.81 m/s^2 along -{up}")
-            return -9.81 * np.eye(3)["XYZ".index(up)]
+            return -9.81 * np.eye(3)["XYZ".index(up)] + 0.0
         path, desc = self.scenes[0]
         for other, _ in self.scenes[1:]:
             self.notes.append(f"{other}: a second PhysicsScene; gravity is that of {path}")
         direction = np.array(desc.gravityDirection, dtype=float)
         magnitude = self.px.UsdPhysics.Scene(self.stage.GetPrimAtPath(path)).GetGravityMagnitudeAttr().Get()
         earth = magnitude is None or not math.isfinite(magnitude) or magnitude < 0.0
-        return (9.81 if earth else self.length * _written(magnitude)) * direction / np.linalg.norm(direction)
+        return (9.81 if earth else self.length * _written(magnitude)) * direction / np.linalg.norm(direction) + 0.0  # no -0
 
     def _composition_errors(self) -> None:
         for error in self.stage.GetCompositionErrors():
@@ -437,6 +439,7 @@ class _Reader:
             index = self.builder.add_body(str(path), **options)
         except (_Unusable, ModelError) as error:
             self.unsupported.append(Ignored(str(path), "rigid body", str(error).removeprefix(f"{path}: ")))
+            self.masses.append(None)
         else:
             self.bodies[path] = _Body(path, frame, index)
 
@@ -584,7 +587,7 @@ class _Reader:
         options: dict[str, Any] = {
             "pose": self._pose(frame, None if body is None else body.frame, rotation),
             "name": str(path),
-            "material": self._material(path, desc),
+            "material": self._material(prim),
             "surface_velocity": self._surface_velocity(prim, frame, rotation),
         }
         try:
@@ -631,14 +634,16 @@ class _Reader:
         self.read_attributes.add(attribute.GetPath())
         return self.length * frame.sign * rotation.T @ frame.rotation @ _decimals(value)
 
-    def _material(self, shape: Any, desc: Any) -> Material:
-        bound = [m for m in desc.materials if not m.isEmpty]
-        if not bound:
-            self.unbound.append(str(shape))
+    def _material(self, prim: Any) -> Material:
+        """Of the physics binding, which the prims above may hold; the parser itself sees only bindings on the collider."""
+        bound = self.px.UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")[0].GetPrim()
+        if not bound or not bound.HasAPI(self.px.UsdPhysics.MaterialAPI):
+            self.unbound.append(str(prim.GetPath()))
             return Material()
-        if bound[0] not in self.materials:
-            self.materials[bound[0]] = self._read_material(bound[0])
-        return self.materials[bound[0]]
+        path = bound.GetPath()
+        if path not in self.materials:
+            self.materials[path] = self._read_material(path)
+        return self.materials[path]
 
     def _read_material(self, path: Any) -> Material:
         prim = self.stage.GetPrimAtPath(path)
@@ -665,14 +670,37 @@ class _Reader:
         by_groups: dict[tuple[Any, ...], list[int]] = {}
         for shape in self.shapes:
             by_groups.setdefault(tuple(shape.desc.collisionGroups), []).append(shape.index)
-        table = self.px.UsdPhysics.CollisionGroup.ComputeCollisionGroupTable(self.stage)
+        apart = self._groups_apart()
         for (groups_a, a), (groups_b, b) in combinations_with_replacement(by_groups.items(), 2):
-            if any(not table.IsCollisionEnabled(ga, gb) for ga, gb in product(groups_a, groups_b)):
+            if any(frozenset(pair) in apart for pair in product(groups_a, groups_b)):
                 self._filter_all(a, b)
         kinds = ("RigidBody", "Articulation", *self._kinds("Shape"))
         for path, desc in (x for kind in kinds for x in self._descs(kind)):
             for target in desc.filteredCollisions:
                 self._filter_all(self._shapes_of(path), self._shapes_of(target))
+
+    def _groups_apart(self) -> set[frozenset[Any]]:
+        """Pairs of collision groups that do not collide (one group: its members among themselves).
+
+        USD's own CollisionGroupTable is not used: it takes a filteredGroups target that does not exist for the first group.
+        """
+        groups = [self.px.UsdPhysics.CollisionGroup(self.stage.GetPrimAtPath(p)) for p, _ in self._descs("CollisionGroup")]
+        merged: dict[Any, list[Any]] = {}  # merge key -> members
+        key = {}
+        for group in groups:
+            name, path = group.GetMergeGroupNameAttr(), group.GetPath()
+            key[path] = f"merge {name.Get()}" if name.HasAuthoredValue() else path
+            merged.setdefault(key[path], []).append(path)
+        apart: set[frozenset[Any]] = set()
+        for group in groups:
+            path, targets = group.GetPath(), group.GetFilteredGroupsRel().GetTargets()
+            for missing in (t for t in targets if t not in key):
+                self.notes.append(f"{path}: physics:filteredGroups names {missing}, which is no collision group")
+            others = {key[t] for t in targets if t in key}
+            if group.GetInvertFilteredGroupsAttr().HasAuthoredValue() and group.GetInvertFilteredGroupsAttr().Get():
+                others = set(merged) - others
+            apart.update(frozenset(pair) for other in others for pair in product(merged[key[path]], merged[other]))
+        return apart
 
     def _filter_all(self, a: list[int], b: list[int]) -> None:
         for i, j in product(a, b):
@@ -776,7 +804,8 @@ class _Reader:
                 self._stray(prim, name)
             elif family == "physics":
                 defined = set(prim.GetPrimDefinition().GetPropertyNames()) if defined is None else defined
-                if name not in defined and not _neutral(attribute.Get()):
+                stray = name.count(":") == 1 and name not in defined and not isinstance(attribute.Get(), str)
+                if stray and not _neutral(attribute.Get()):
                     families.setdefault("physics", []).append(name)
             elif _changes_motion(name, attribute):
                 families.setdefault(family, []).append(name)
