@@ -24,6 +24,7 @@ _PUBLIC = {
     "RerunLogger": "logger",
     "SceneError": "errors",
     "ShapeType": "model",
+    "SimulationError": "errors",
     "Simulator": "simulator",
     "Status": "simulator",
     "WarpLcpError": "errors",

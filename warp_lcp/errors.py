@@ -14,6 +14,10 @@ class SceneError(WarpLcpError):
     """A USD stage that cannot be read or means something that is not supported; names the file and the prim."""
 
 
+class SimulationError(RuntimeError):
+    """An environment is not OK after a step; raised only by a Simulator with ``strict=True``."""
+
+
 class MissingExtra(WarpLcpError, ImportError):
     """An optional dependency is absent; names the extra that installs it."""
 

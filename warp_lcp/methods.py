@@ -43,6 +43,8 @@ def workspaces(num_envs: int, device: wp.Device) -> int:
 class Lemke:
     """Lemke's method on the assembled LCP of eq. 39, no fallback."""
 
+    block_dim: int | None = LANES
+
     def prepare(self, sim: Simulator) -> None:
         r, real = sim.model.max_contacts, sim.real
         slots = workspaces(sim.num_envs, sim.device)
@@ -66,6 +68,7 @@ class BlockPGS:
     """Block projected Gauss-Seidel: a fixed number of cold sweeps, fewer where it converges."""
 
     SWEEPS = 50
+    block_dim: int | None = None
 
     def prepare(self, sim: Simulator) -> None:
         self.kernel = pgs.make(sim.real)

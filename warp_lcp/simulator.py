@@ -5,19 +5,29 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from .errors import WarpLcpError
-from .kernels import bodies, box_box, certify, collide, contacts
+from .errors import SimulationError, WarpLcpError
+from .kernels import bodies, box_box, certify, collide, contacts, reset
 from .kernels.types import scalar_types
-from .methods import METHODS
+from .methods import LANES, METHODS
 from .model import Model, ShapeType
 
 SLIDING = ("regularized", "aligned", "facets")
 PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.float32)}
+#: Parameters that may differ between environments, and what their numbers must be.
+PARAMETERS = {
+    "mass": "it must be finite and greater than zero",
+    "inertia": "it must be finite and positive definite",
+    "com": "it must be finite",
+    "friction": "it must be finite and not negative",
+    "contact": "it must be finite and not negative, or NaN for Table 1",
+    "gravity": "it must be finite",
+}
 #: Largest residual [m/s] of an answer that counts as solved.
 TOLERANCE = 1e-6
 
@@ -158,7 +168,91 @@ class Simulator:
             if mask.shape != (self.num_envs,):
                 raise WarpLcpError(f"reset: mask has shape {mask.shape}; give ({self.num_envs},), one bool an environment")
             mask = wp.array(mask, dtype=wp.bool, device=self.device)
-        raise NotImplementedError
+        elif mask.shape != (self.num_envs,) or mask.dtype is not wp.bool:
+            raise WarpLcpError(f"reset: mask is {mask.shape} of {mask.dtype.__name__}; give ({self.num_envs},) of wp.bool")
+        inputs = [mask, self.q0, self.v0, self.q, self.v, self.wrench, self.rows, self.slots]
+        inputs += [self.residual, self.residual_energy, self.iterations, self.status]
+        wp.launch(self._kernels.reset, dim=self.num_envs, inputs=inputs, device=self.device)
+
+    # ------------------------------------------------------------------------------------------- parameters and views
+
+    def set_parameters(self, **values: Any) -> None:
+        """Change physical parameters, for all environments alike or one by one; nothing is recompiled.
+
+        Each value has the shape of the Model's field, or that with num_envs in front: ``mass`` [B], ``inertia``
+        [B, 3, 3] about the centre of mass in body axes, ``com`` [B, 3], ``friction`` [S, 2] (static, dynamic),
+        ``contact`` [S, 5] (k_n, b_n, k_t, b_t, v_s; NaN = Table 1 scaled with the mass) and ``gravity`` [3]. SI units.
+
+        What follows from a parameter follows at once: inverse masses, the scaling of Table 1, the coefficients of a
+        pair. ``mass`` without ``inertia`` is a body of the same shape and another density: its inertia scales along.
+
+        Raises:
+            WarpLcpError: for an unknown name, a wrong shape, or a number that no body or contact can have.
+        """
+        checked = {name: self._checked_parameter(name, value) for name, value in values.items()}
+        if "mass" in checked and "inertia" not in checked:
+            inertia, mass = self.parameters.inertia.numpy(), self.parameters.mass.numpy()
+            checked["inertia"] = inertia * (checked["mass"] / mass)[..., None, None]
+        for name, value in checked.items():
+            present = getattr(self.parameters, name)
+            if present.shape[0] == value.shape[0]:
+                present.assign(value.astype(self._numpy_real))
+            else:
+                setattr(self.parameters, name, self._constant(value, present.dtype))
+                self._graph = None  # it holds the address of the old array
+
+    def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
+        if name not in PARAMETERS:
+            raise WarpLcpError(f"set_parameters: {name!r} is not a parameter; choose from {', '.join(PARAMETERS)}")
+        array = np.asarray(value.numpy() if isinstance(value, wp.array) else value, dtype=float)
+        shape = getattr(self.model, name).shape
+        if array.shape == shape:
+            array = array[None]
+        if array.shape not in ((1, *shape), (self.num_envs, *shape)):
+            raise WarpLcpError(f"set_parameters: {name} has shape {array.shape}; give {shape} or {(self.num_envs, *shape)}")
+        allowed = np.isfinite(array) | (np.isnan(array) & (name == "contact"))
+        if name == "mass":
+            allowed &= array > 0.0
+        elif name in ("friction", "contact"):
+            allowed &= ~(array < 0.0)
+        elif name == "inertia" and allowed.all():
+            allowed &= (np.linalg.eigvalsh(array) > 0.0).all(-1)[..., None, None]
+        if not allowed.all():
+            where = tuple(int(i) for i in np.argwhere(~allowed)[0])
+            raise WarpLcpError(f"set_parameters: {name}{list(where)} is {array[where]}; {PARAMETERS[name]}")
+        return array
+
+    @property
+    def body_pose(self) -> wp.array:
+        """[E, B] transform (x y z qx qy qz qw) of each body frame in the world, up to date with q when read."""
+        self._refresh_bodies()
+        return self.bodies.pose
+
+    @property
+    def body_velocity(self) -> wp.array:
+        """[E, B] spatial vector (velocity of the centre of mass [m/s], angular velocity [rad/s]), world axes."""
+        self._refresh_bodies()
+        return self.bodies.velocity
+
+    def _refresh_bodies(self) -> None:
+        inputs = [self.q, self.v, self.topology, self.bodies]
+        wp.launch(self._kernels.kinematics, dim=(self.num_envs, self.model.num_bodies), inputs=inputs, device=self.device)
+
+    @property
+    def contacts(self) -> Contacts:
+        """Contacts of the last step (views of the device arrays)."""
+        r = self.rows
+        return Contacts(r.count, r.body, r.point, r.gap, r.frame, r.impulse, r.velocity, r.state)
+
+    def _raise_for_status(self) -> None:
+        status = self.status.numpy()
+        bad = np.flatnonzero(status)
+        if len(bad):
+            what = " | ".join(bit.name or "" for bit in Status if bit and status[bad[0]] & bit)
+            raise SimulationError(
+                f"{len(bad)} of {self.num_envs} environments are not OK at t = {self.time:.6g} s; first: environment {bad[0]}, "
+                f"{what}, residual {self.residual.numpy()[bad[0]]:.3g} m/s"
+            )
 
     def _step_kernels(self) -> None:
         """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back."""
@@ -256,8 +350,6 @@ class Simulator:
         self.residual, self.residual_energy = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(2))
 
     def _load_kernels(self) -> None:
-        from types import SimpleNamespace
-
         real, m = self.real, self.model
         body, cert = bodies.make(real), certify.make(real)
         self._kernels = SimpleNamespace(
@@ -267,6 +359,7 @@ class Simulator:
             certify=cert.certify,
             remember=cert.remember,
             integrate=cert.integrate,
+            reset=reset.make(real),
         )
         self._pair_kernels: list[tuple[Any, int, int, tuple]] = []
         kinds = [tuple(ShapeType(m.shape_type[s]).name for s in pair) for pair in m.pairs]
@@ -279,6 +372,11 @@ class Simulator:
         self._methods = [method() for method in METHODS[self.method]]
         for method in self._methods:
             method.prepare(self)
+        threads = [*vars(self._kernels).values(), *(kernel for kernel, *_ in self._pair_kernels)]
+        for block_dim in (None, LANES):
+            kernels = [m.kernel for m in self._methods if m.block_dim == block_dim] + (threads if block_dim is None else [])
+            if kernels:
+                wp.force_load(self.device, modules=[k.module for k in kernels], block_dim=block_dim)
 
 
 def _choice(what: str, value: str, choices: tuple[str, ...]) -> None:
