@@ -455,10 +455,10 @@ class _Reader:
         """Mass [kg], centre of mass [m, body frame] and inertia [kg m^2, body axes]; None where unknown.
 
         USD's own precedence rules, by ComputeMassProperties. What is authored on the body itself is taken from there:
-        the function works in single precision and takes any inertia under 1e-5 for unauthored.
+        the function takes any inertia under 1e-5 for unauthored and works in single precision.
         """
         prim = self.stage.GetPrimAtPath(path)
-        own = [p for p, d in self.colliders.items() if d.rigidBody == path]
+        own = [p for p, d in self.colliders.items() if d.rigidBody == path and d.collisionEnabled]
         for p in (path, *own):
             self._check_authored(p)
         unknown: list[Any] = []
@@ -480,6 +480,8 @@ class _Reader:
         if unknown and not authored["mass"]:
             return {"mass": None}
         values: dict[str, Any] = {"mass": self.mass_unit * mass}
+        if len(own) == 1 and not self.stage.GetPrimAtPath(own[0]).HasAPI(self.px.UsdPhysics.MassAPI):
+            unknown = own  # whatever its density: the builder finds centre and inertia in double precision
         if not unknown or authored["com"] is not None:
             values["com"] = self.length * np.array(com, dtype=float)
         if not unknown or authored["diagonal"] is not None:
@@ -684,7 +686,8 @@ class _Reader:
 
         USD's own CollisionGroupTable is not used: it takes a filteredGroups target that does not exist for the first group.
         """
-        groups = [self.px.UsdPhysics.CollisionGroup(self.stage.GetPrimAtPath(p)) for p, _ in self._descs("CollisionGroup")]
+        schema = self.px.UsdPhysics.CollisionGroup
+        groups = [schema(p) for p in self.prims if p.IsA(schema)]
         merged: dict[Any, list[Any]] = {}  # merge key -> members
         key = {}
         for group in groups:

@@ -1,0 +1,805 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading USD scenes: units, mass, poses, materials, pairs, what is refused, and what the shipped scenes say."""
+
+import builtins
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import warp_lcp as wl
+from warp_lcp import JointType, ShapeType, scenes
+from warp_lcp.usd import read_usd
+
+pytest.importorskip("pxr", reason="needs the extra 'usd'")
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "usd"
+needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason=f"{SHARED} does not exist")
+
+SI = 'metersPerUnit = 1\n    kilogramsPerUnit = 1\n    upAxis = "Z"'
+CM = 'metersPerUnit = 0.01\n    kilogramsPerUnit = 1\n    upAxis = "Z"'
+SCENE = 'def PhysicsScene "Scene" {}'
+BODY = "PhysicsRigidBodyAPI"
+MASS = "PhysicsMassAPI"
+COLLIDER = "PhysicsCollisionAPI"
+
+
+def prim(kind, name, apis=(), content="", metadata=""):
+    """Text of one prim; ';' ends a statement, so that cases stay short."""
+    api = f"prepend apiSchemas = [{', '.join(f'{chr(34)}{a}{chr(34)}' for a in apis)}]" if apis else ""
+    return f'def {kind} "{name}" (\n{api}\n{metadata}\n)\n{{\n' + content.replace(";", "\n") + "\n}\n"
+
+
+def xform(**ops):
+    order = ", ".join(f'"xformOp:{name}"' for name in ops)
+    types = {"translate": "double3", "scale": "double3", "rotateXYZ": "double3"}
+    lines = [f"{types.get(n, 'double')} xformOp:{n} = {v}" for n, v in ops.items()]
+    return ";".join([*lines, f"uniform token[] xformOpOrder = [{order}]"]) + ";"
+
+
+def layer(*prims, head=SI):
+    return f"#usda 1.0\n(\n    {head}\n)\n" + "\n".join(p.replace("{}", "{\n}") for p in prims)
+
+
+def stage(*prims, head=SI):
+    from pxr import Sdf, Usd
+
+    root = Sdf.Layer.CreateAnonymous(".usda")
+    root.ImportFromString(layer(*prims, head=head))
+    return Usd.Stage.Open(root)
+
+
+def cube(name="C", content="", apis=(COLLIDER,), size=1.0):
+    return prim("Cube", name, apis, f"double size = {size};{content}")
+
+
+def body(name="B", content="", inner=None, apis=(BODY, MASS)):
+    return prim("Xform", name, apis, content + ";" + (cube() if inner is None else inner))
+
+
+def load(*prims, head=SI, **options):
+    return wl.load_usd(stage(SCENE, *prims, head=head), **options)
+
+
+def read(*prims, head=SI, **options):
+    return read_usd(stage(SCENE, *prims, head=head), **options)
+
+
+def refused(*prims, head=SI):
+    with pytest.raises(wl.SceneError) as caught:
+        load(*prims, head=head)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def material(content, name="M"):
+    return prim("Material", name, ("PhysicsMaterialAPI",), content)
+
+
+BOUND = "rel material:binding:physics = </M>;"
+
+
+def bound_cube(content="", name="C"):
+    return cube(name, BOUND + content, (COLLIDER, "MaterialBindingAPI"))
+
+
+# -- units ----------------------------------------------------------------------------------------------------------
+
+
+def test_centimetre_stage_is_converted():
+    spin = "vector3f physics:velocity = (100, 0, 0); vector3f physics:angularVelocity = (0, 0, 180);"
+    model = load(body(content=spin + xform(translate="(0, 0, 500)"), inner=cube(size=25)), head=CM)
+    assert model.mass == pytest.approx([15.625], rel=1e-6)  # (0.25 m)^3 at 1000 kg/m^3
+    assert model.inertia[0] == pytest.approx(15.625 * 0.25**2 / 6 * np.eye(3), rel=1e-6)
+    assert model.q0 == pytest.approx([0, 0, 5, 0, 0, 0, 1])
+    assert model.v0 == pytest.approx([1, 0, 0, 0, 0, math.pi])
+    assert model.shape_size[0] == pytest.approx([0.125] * 3)
+    assert model.gravity == pytest.approx([0, 0, -9.81])
+
+
+def test_gravity_in_stage_units_and_along_an_authored_direction():
+    scene = prim("PhysicsScene", "S", (), "vector3f physics:gravityDirection = (0, 3, 4); float physics:gravityMagnitude = 162;")
+    model = wl.load_usd(stage(scene, body(), head=CM))
+    assert model.gravity == pytest.approx([0, 1.62 * 0.6, 1.62 * 0.8])
+
+
+def test_kilograms_per_unit():
+    grams = SI.replace("kilogramsPerUnit = 1", "kilogramsPerUnit = 0.001")
+    inertia = "float physics:mass = 5; float3 physics:diagonalInertia = (1, 1, 1);"
+    model = load(body(content=inertia), body("Default"), head=grams)
+    assert model.mass == pytest.approx([0.005, 1000.0], rel=1e-6)  # the default density is 1000 kg/m^3 in any unit
+    assert model.inertia[0] == pytest.approx(0.001 * np.eye(3))
+
+
+def test_small_inertia_in_grams_and_centimetres():
+    head = CM.replace("kilogramsPerUnit = 1", "kilogramsPerUnit = 0.001")
+    model = load(body(content="float physics:mass = 3; float3 physics:diagonalInertia = (2, 2, 2);"), head=head)
+    assert model.inertia[0] == pytest.approx(2e-7 * np.eye(3), rel=1e-6)  # g cm^2
+
+
+def test_unauthored_units_follow_usd_and_are_noted():
+    reading = read(body(), head='upAxis = "Z"')
+    assert (reading.meters_per_unit, reading.kilograms_per_unit) == (0.01, 1.0)
+    assert any("metersPerUnit is not authored" in n for n in reading.report.notes)
+
+
+def test_meters_per_unit_can_be_overridden_and_the_stage_is_left_alone():
+    from pxr import UsdGeom
+
+    source = stage(SCENE, body(), head=CM)
+    model = wl.load_usd(source, meters_per_unit=2.0)
+    assert model.mass == pytest.approx([8000.0], rel=1e-6)
+    assert model.gravity == pytest.approx([0, 0, -9.81])
+    assert UsdGeom.GetStageMetersPerUnit(source) == 0.01
+    with pytest.raises(wl.SceneError, match="meters_per_unit is 0"):
+        wl.load_usd(source, meters_per_unit=0.0)
+
+
+def test_up_axis_and_missing_scene_prim():
+    model = wl.load_usd(stage(body(), head=SI.replace('"Z"', '"Y"')))
+    assert (model.up_axis, model.gravity.tolist()) == ("Y", [0, -9.81, 0])
+    assert any("no PhysicsScene" in n for n in model.report.notes)
+
+
+# -- mass -----------------------------------------------------------------------------------------------------------
+
+DENSE = cube(content="float physics:density = 250;", apis=(COLLIDER, MASS))
+HEAVY = cube(content="float physics:mass = 7;", apis=(COLLIDER, MASS))
+OFF = cube("Off", "bool physics:collisionEnabled = 0; float physics:mass = 50;" + xform(translate="(3, 0, 0)"), (COLLIDER, MASS))
+
+
+@pytest.mark.parametrize(
+    ("content", "inner", "mass"),
+    [
+        ("", cube(), 1000.0),
+        ("float physics:mass = 3;", cube(), 3.0),
+        ("float physics:mass = 3;", HEAVY, 3.0),
+        ("float physics:mass = 3; float physics:density = 9;", cube(), 3.0),
+        ("", HEAVY, 7.0),
+        ("float physics:density = 500;", cube(), 500.0),
+        ("float physics:density = 500;", DENSE, 250.0),
+        ("", bound_cube(), 400.0),
+        ("", cube(content=BOUND + "float physics:density = 250;", apis=(COLLIDER, MASS, "MaterialBindingAPI")), 250.0),
+        ("float physics:mass = 0;", cube(), 1000.0),
+        ("", cube() + OFF, 1000.0),
+    ],
+    ids=["default", "body", "body-over-child", "mass-over-density", "child", "density", "child-density", "material",
+         "density-over-material", "zero-is-unauthored", "disabled"],
+)  # fmt: skip
+def test_mass_precedence(content, inner, mass):
+    model = load(material("float physics:density = 400;"), body(content=content, inner=inner))
+    assert model.mass == pytest.approx([mass], rel=1e-6)
+    assert model.com[0] == pytest.approx([0, 0, 0], abs=1e-9)
+    assert model.inertia[0] == pytest.approx(mass / 6 * np.eye(3), rel=1e-6)
+
+
+def test_zero_mass_on_a_body_with_collider_is_noted():
+    assert any("physics:mass = 0" in n for n in read(body(content="float physics:mass = 0;")).report.notes)
+
+
+def test_compound_mass_by_the_parallel_axis_theorem():
+    inner = cube("Left", xform(translate="(-1, 0, 0)")) + cube("Right", xform(translate="(2, 0, 0)"))
+    model = load(body(inner=inner))
+    assert model.mass == pytest.approx([2000.0])
+    assert model.com[0] == pytest.approx([0.5, 0, 0])
+    across = 2 * 1000 / 6 + 2 * 1000 * 1.5**2
+    assert model.inertia[0] == pytest.approx(np.diag([2000 / 6, across, across]), rel=1e-5, abs=1e-2)
+    scaled = load(body(content="float physics:mass = 10;", inner=inner))
+    assert scaled.inertia[0] == pytest.approx(model.inertia[0] / 200, rel=1e-5, abs=1e-4)
+
+
+def test_authored_centre_of_mass_and_principal_axes():
+    content = (
+        "float physics:mass = 2; point3f physics:centerOfMass = (0.1, 0.2, 0); float3 physics:diagonalInertia = (1, 2, 2.5);"
+        "quatf physics:principalAxes = (0.70710678, 0, 0, 0.70710678);" + xform(scale="(2, 2, 2)")
+    )
+    model = load(body(content=content))
+    assert model.com[0] == pytest.approx([0.2, 0.4, 0])  # the prim's local space, scale included
+    assert model.inertia[0] == pytest.approx(np.diag([2, 1, 2.5]), abs=1e-6)  # a quarter turn about z swaps x and y
+
+
+def test_centre_of_mass_alone_shifts_the_inertia():
+    model = load(body(content="float physics:mass = 6; point3f physics:centerOfMass = (0, 0, -0.5);"))
+    assert model.com[0] == pytest.approx([0, 0, -0.5])
+    assert model.inertia[0] == pytest.approx(np.diag([1 + 1.5, 1 + 1.5, 1]))
+
+
+def test_mass_without_collider_takes_the_small_sphere_of_usd():
+    reading = read(body(content="float physics:mass = 2;", inner=""), cube("Ground"))
+    model = reading.builder.finalize(reading.report)
+    assert model.inertia[0] == pytest.approx(0.4 * 2 * 0.1**2 * np.eye(3), rel=1e-6)
+    assert any("no collider" in n for n in reading.report.notes)
+
+
+@pytest.mark.parametrize(
+    ("content", "inner", "what"),
+    [
+        ("", "", "mass is zero"),
+        ("float physics:mass = 0;", "", "mass is zero"),
+        ("", OFF, "mass is zero"),
+        ("float physics:mass = -3;", None, "physics:mass is -3"),
+        ("float physics:mass = inf;", None, "physics:mass is inf"),
+        ("float physics:density = -1;", None, "physics:density is -1"),
+        ("", cube(content="float physics:mass = -2;", apis=(COLLIDER, MASS)), "/B/C: physics:mass is -2"),
+        ("float3 physics:diagonalInertia = (1, 1, 5);", None, "triangle inequality"),
+    ],
+)
+def test_unusable_mass_is_refused_by_name(content, inner, what):
+    message = refused(body(content=content, inner=inner))
+    assert "/B" in message
+    assert what in message
+
+
+def test_total_mass_of_shapes_that_are_not_simulated_yet():
+    shapes = {
+        "Capsule": ("double radius = 0.5; double height = 2;", math.pi * 0.25 * 2 + 4 / 3 * math.pi * 0.125),
+        "Cylinder": ("double radius = 0.5; double height = 2;", math.pi * 0.25 * 2),
+        "Cone": ("double radius = 0.5; double height = 2;", math.pi * 0.25 * 2 / 3),
+    }
+    for kind, (content, volume) in shapes.items():
+        reading = read(body(inner=prim(kind, "C", (COLLIDER,), content)))
+        assert reading.mass == pytest.approx(1000 * volume, rel=1e-5)
+        assert [i.path for i in reading.report.unsupported] == ["/B/C"]
+    mesh = "point3f[] points = [(0,0,0),(1,0,0),(0,1,0)]; int[] faceVertexCounts = [3]; int[] faceVertexIndices = [0,1,2];"
+    assert read(body(inner=prim("Mesh", "C", (COLLIDER,), mesh))).mass is None
+
+
+# -- poses ----------------------------------------------------------------------------------------------------------
+
+
+def test_nested_transforms_and_non_uniform_scale():
+    inner = cube("C", xform(translate="(1, 0, 0)", rotateZ=90, scale="(1, 2, 3)"))
+    outer = xform(translate="(0, 0, 10)", rotateZ=90, scale="(2, 2, 2)")
+    model = load(prim("Xform", "Root", (), outer + body(content=xform(translate="(1, 0, 0)"), inner=inner)))
+    half = math.sqrt(0.5)
+    assert model.body_names == ("/Root/B",)
+    assert model.q0 == pytest.approx([0, 2, 10, 0, 0, half, half])
+    assert model.shape_pose[0] == pytest.approx([2, 0, 0, 0, 0, half, half])
+    assert model.shape_size[0] == pytest.approx([1, 2, 3])
+    assert model.mass == pytest.approx([1000 * 2 * 4 * 6], rel=1e-6)
+
+
+def test_mirrored_transforms_keep_proper_rotations():
+    plane = prim("Plane", "P", (COLLIDER,), 'uniform token axis = "X";' + xform(scale="(-1, 1, 1)"))
+    ball = prim("Sphere", "S", (COLLIDER,), "double radius = 1;" + xform(scale="(2, -2, 2)"))
+    model = load(plane, body(content=xform(translate="(1, 2, 3)", scale="(-1, 1, 1)"), inner=cube(size=2)), body("B2", inner=ball))
+    assert np.linalg.norm(model.q0[3:7]) == pytest.approx(1)
+    assert model.shape_size[1:].tolist() == [[1, 1, 1], [2, 0, 0]]
+    x, y, z, w = model.shape_pose[0, 3:]
+    normal = [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)]
+    assert normal == pytest.approx([-1, 0, 0], abs=1e-12)  # +x, mirrored
+
+
+def test_sheared_cube_and_ellipsoid_are_refused():
+    slanted = prim("Xform", "X", (), xform(scale="(1, 2, 1)") + cube("C", xform(rotateZ=30)))
+    egg = prim("Sphere", "Egg", (COLLIDER,), xform(scale="(1, 1, 1.5)"))
+    message = refused(body(), slanted, egg)
+    assert "sheared Cube collider /X/C" in message
+    assert "ellipsoid /Egg" in message
+
+
+def test_velocities_are_along_the_body_and_of_its_centre_of_mass():
+    content = (
+        "float physics:mass = 1; point3f physics:centerOfMass = (0.4, 0, 0);"
+        "vector3f physics:velocity = (2, 0, 0); vector3f physics:angularVelocity = (90, 0, 0);"
+    )
+    model = load(body(content=content + xform(rotateZ=90, scale="(3, 3, 3)")))
+    assert model.v0 == pytest.approx([0, 2, 0, 0, math.pi / 2, 0], abs=1e-12)
+
+
+def test_shapes_of_static_colliders_stand_in_the_world():
+    model = load(
+        body(), prim("Xform", "X", (), xform(translate="(0, 0, -2)") + prim("Plane", "P", (COLLIDER,), 'uniform token axis = "Z";'))
+    )
+    assert model.shape_names == ("/B/C", "/X/P")
+    assert model.shape_type.tolist() == [ShapeType.BOX, ShapeType.PLANE]
+    assert model.shape_body.tolist() == [0, -1]
+    assert model.shape_pose[1] == pytest.approx([0, 0, -2, 0, 0, 0, 1])
+    assert model.pairs.tolist() == [[1, 0]]
+
+
+# -- bodies ---------------------------------------------------------------------------------------------------------
+
+
+def test_kinematic_body_keeps_its_velocity_and_needs_no_mass():
+    inner = prim("Plane", "P", (COLLIDER,), "")
+    model = load(body("K", "bool physics:kinematicEnabled = 1; vector3f physics:velocity = (1, 0, 0);", inner), body())
+    assert model.joint_type.tolist() == [JointType.KINEMATIC, JointType.FREE]
+    assert model.v0[:3].tolist() == [1, 0, 0]
+    assert read(body("K", "bool physics:kinematicEnabled = 1;"), body()).mass == pytest.approx(1000)
+
+
+def test_animated_kinematic_body_is_reported():
+    moved = 'double3 xformOp:translate.timeSamples = { 0: (0, 0, 1), 1: (1, 0, 1) }; uniform token[] xformOpOrder = ["xformOp:translate"];'
+    reading = read(body("K", "bool physics:kinematicEnabled = 1;" + moved))
+    assert [(i.path, i.what) for i in reading.report.ignored] == [("/K", "animated pose")]
+    assert reading.builder.finalize().q0[:3].tolist() == [0, 0, 1]
+
+
+def test_nested_bodies_are_independent_and_in_stage_order():
+    inner = cube() + body("N", xform(translate="(0, 0, 5)"))
+    model = load(body("A", xform(translate="(1, 0, 0)"), inner), body("Z"))
+    assert model.body_names == ("/A", "/A/N", "/Z")
+    assert model.q0[7:10].tolist() == [1, 0, 5]
+    assert model.mass == pytest.approx([1000] * 3)
+    assert len(model.pairs) == 3
+
+
+def test_disabled_body_becomes_static():
+    model = load(body("Off", "bool physics:rigidBodyEnabled = 0;"), body())
+    assert model.body_names == ("/B",)
+    assert model.shape_body.tolist() == [-1, 0]
+    assert any(n.startswith("/Off: physics:rigidBodyEnabled") for n in model.report.notes)
+
+
+def test_disabled_collider_makes_no_contact():
+    model = load(body(), cube("Ground", "bool physics:collisionEnabled = 0;"))
+    assert model.shape_names == ("/B/C",)
+
+
+def test_instances_are_read_and_their_prototype_is_not():
+    proto = body("Part").replace("def Xform", "class Xform", 1)
+    copies = [prim("Xform", n, (), "", "instanceable = true\nprepend references = </Part>") for n in ("I1", "I2")]
+    model = load(proto, *copies)
+    assert model.body_names == ("/I1", "/I2")
+    assert model.shape_names == ("/I1/C", "/I2/C")
+
+
+def test_only_the_first_scene_is_simulated():
+    owner = "rel physics:simulationOwner = </Other>;"
+    reading = read(prim("PhysicsScene", "Other"), body("A"), body("B", owner), cube("Ground", owner))
+    assert (reading.bodies, reading.shapes) == (("/A",), ("/A/C",))
+    assert sorted(i.path for i in reading.report.ignored) == ["/B", "/Ground"]
+    assert any(n.startswith("/Other: a second PhysicsScene") for n in reading.report.notes)
+
+
+# -- materials and pairs --------------------------------------------------------------------------------------------
+
+
+def test_material_inherited_from_above():
+    root = prim("Xform", "Root", ("MaterialBindingAPI",), BOUND + body())
+    model = load(material("float physics:staticFriction = 0.8; float physics:dynamicFriction = 0.6;"), root)
+    assert model.friction.tolist() == [[0.8, 0.6]]
+    assert not model.report.notes
+
+
+def test_no_material_takes_the_default_and_is_noted():
+    model = load(body(), cube("Ground"))
+    assert model.friction.tolist() == [[0.5, 0.5]] * 2
+    assert [n for n in model.report.notes if "no physics material on /B/C, /Ground: friction 0.5 / 0.5" in n]
+
+
+def test_static_friction_below_dynamic_takes_the_larger():
+    model = load(material("float physics:dynamicFriction = 0.3;"), body(inner=bound_cube()))
+    assert model.friction.tolist() == [[0.3, 0.3]]
+    assert any("/M: dynamicFriction 0.3 exceeds staticFriction 0" in n for n in model.report.notes)
+
+
+def test_restitution_is_reported():
+    ignored = load(material("float physics:restitution = 0.8;"), body(inner=bound_cube())).report.ignored
+    assert [(i.path, i.what, i.why) for i in ignored] == [("/M", "physics:restitution = 0.8", "restitution is not simulated yet")]
+
+
+def test_contact_parameters_in_stage_units():
+    attributes = (
+        "float warpLcp:normalStiffness = 1e6; float warpLcp:normalDamping = 1e4; double warpLcp:tangentStiffness = 2e5;"
+        "float warpLcp:tangentDamping = 300; float warpLcp:slipThreshold = 5;"
+    )
+    head = CM.replace("kilogramsPerUnit = 1", "kilogramsPerUnit = 0.001")
+    model = load(material(attributes), body(inner=bound_cube()), cube("Ground"), head=head)
+    assert model.contact[0] == pytest.approx([1e3, 10, 200, 0.3, 0.05])  # g/s^2, g/s and cm/s
+    assert np.isnan(model.contact[1]).all()
+    assert not model.report.ignored
+
+
+def test_surface_velocity_is_along_the_colliders_axes():
+    belt = "vector3f warpLcp:surfaceVelocity = (100, 20, 0);"
+    plane = prim("Plane", "P", (COLLIDER,), 'uniform token axis = "X"; vector3f warpLcp:surfaceVelocity = (0, 100, 0);')
+    model = load(body(), cube("Belt", belt + xform(rotateZ=90, scale="(4, 1, 0.1)")), plane, head=CM)
+    assert model.shape_surface_velocity[1] == pytest.approx([1, 0.2, 0])
+    x, y, z, w = model.shape_pose[2, 3:]
+    rotation = wl.builder.rotation_matrix(np.array([x, y, z, w]))
+    assert rotation @ model.shape_surface_velocity[2] == pytest.approx([0, 1, 0], abs=1e-12)
+
+
+def test_own_attributes_in_the_wrong_place_or_misspelt_are_reported():
+    stray = "float warpLcp:normalStifness = 1; vector3f warpLcp:surfaceVelocity = (1, 0, 0);"
+    ignored = read(body(content=stray)).report.ignored
+    assert {i.what for i in ignored} == {"warpLcp:normalStifness", "warpLcp:surfaceVelocity"}
+    assert any("did you mean warpLcp:normalStiffness?" in i.why for i in ignored)
+
+
+def group(name, members, content=""):
+    return prim("PhysicsCollisionGroup", name, (), f"rel collection:colliders:includes = [{', '.join(members)}];" + content)
+
+
+def touching(*prims):
+    model = load(body("A"), body("B"), cube("Ground"), *prims)
+    return {tuple(sorted(model.shape_names[i].strip("/")[0] for i in pair)) for pair in model.pairs}
+
+
+ALL = {("A", "B"), ("A", "G"), ("B", "G")}
+
+
+@pytest.mark.parametrize(
+    ("prims", "apart"),
+    [
+        ((group("G1", ["</A>"], "rel physics:filteredGroups = </G2>;"), group("G2", ["</B>"])), {("A", "B")}),
+        ((group("G1", ["</A>", "</B>"], "rel physics:filteredGroups = </G1>;"),), {("A", "B")}),
+        ((group("G1", ["</A>", "</B>"], "rel physics:filteredGroups = </Nowhere>;"),), set()),
+        (
+            (
+                group("G1", ["</A>"], "rel physics:filteredGroups = </G2>; bool physics:invertFilteredGroups = 1;"),
+                group("G2", ["</B>"]),
+                group("G3", ["</Ground>"]),
+            ),
+            {("A", "G")},
+        ),
+        (
+            (
+                group("G1", ["</A>"], "rel physics:filteredGroups = </G3>;"),
+                group("G2", ["</B>"], 'string physics:mergeGroup = "x";'),
+                group("G3", ["</Ground>"], 'string physics:mergeGroup = "x";'),
+            ),
+            {("A", "B"), ("A", "G")},
+        ),
+    ],
+    ids=["two-groups", "one-group", "missing-target", "inverted", "merged"],
+)
+def test_collision_groups(prims, apart):
+    assert touching(*prims) == ALL - apart
+
+
+def test_filtered_pairs_of_bodies_and_colliders():
+    filtered = (BODY, MASS, "PhysicsFilteredPairsAPI")
+    model = load(
+        body("A", "rel physics:filteredPairs = [</B>, </Ground>];", cube() + body("N"), filtered),
+        body("B", "rel physics:filteredPairs = </A/N/C>;", apis=filtered),
+        cube("Ground"),
+    )
+    names = {frozenset(model.shape_names[i] for i in pair) for pair in model.pairs}
+    assert names == {frozenset(x) for x in [("/A/C", "/A/N/C"), ("/A/N/C", "/Ground"), ("/B/C", "/Ground")]}
+
+
+# -- what is not simulated ------------------------------------------------------------------------------------------
+
+JOINT = "rel physics:body0 = </A>; rel physics:body1 = </B>;"
+
+
+def test_joints_are_refused_and_disabled_joints_ignored():
+    joint = prim("PhysicsRevoluteJoint", "J", ("PhysicsDriveAPI:angular",), JOINT + "float drive:angular:physics:stiffness = 3;")
+    message = refused(body("A"), body("B"), joint)
+    assert "PhysicsRevoluteJoint /J: joints are not supported yet" in message
+    reading = read(
+        body("A"), body("B"), joint.replace(JOINT.replace(";", "\n"), JOINT.replace(";", "\n") + "bool physics:jointEnabled = 0\n")
+    )
+    assert (reading.joints, reading.report.unsupported) == ((), ())
+    assert [(i.path, i.what) for i in reading.report.ignored] == [("/J", "PhysicsRevoluteJoint")]
+
+
+def test_unknown_joint_type_collider_on_xform_and_bare_articulation_root():
+    strange = prim("DistancePhysicsJoint", "J", (), JOINT)
+    floor = prim("Xform", "Floor", (COLLIDER,))
+    reading = read(body("A", apis=(BODY, "PhysicsArticulationRootAPI")), body("B"), strange, floor)
+    assert [(i.path, i.what) for i in reading.report.ignored] == [
+        ("/A", "articulation root"),
+        ("/J", "DistancePhysicsJoint"),
+        ("/Floor", "PhysicsCollisionAPI on Xform"),
+    ]
+    assert not reading.report.unsupported
+
+
+def test_unsupported_shapes_are_all_named():
+    others = [prim(kind, kind, (COLLIDER,)) for kind in ("Capsule", "Cylinder", "Cone", "Mesh", "Capsule_1")]
+    plane = body("Flying", inner=prim("Plane", "P", (COLLIDER,)) + cube())
+    off = prim("Cone", "Off", (COLLIDER,), "bool physics:collisionEnabled = 0;")
+    message = refused(plane, *others, off)
+    assert "Plane collider /Flying/P: a plane is infinite" in message
+    for kind in ("Capsule", "Cylinder", "Cone", "Mesh", "Capsule_1"):
+        assert f"{kind} collider /{kind}" in message
+    assert "/Off" not in message
+
+
+def test_point_instancer_with_physics():
+    inner = (
+        prim("Scope", "Protos", (), body("P"))
+        + "rel prototypes = </I/Protos/P>\nint[] protoIndices = [0]\npoint3f[] positions = [(0,0,0)]\n"
+    )
+    reading = read(body(), prim("PointInstancer", "I", (), inner))
+    assert [(i.path, i.what) for i in reading.report.unsupported] == [("/I", "PointInstancer")]
+    assert reading.bodies == ("/B",)
+
+
+def test_attributes_of_other_engines_are_reported_once_per_family():
+    content = (
+        "bool physxRigidBody:disableGravity = 1; float physxRigidBody:linearDamping = 0.1; float physxRigidBody:angularDamping = 0;"
+        "int physxRigidBody:solverPositionIterationCount = 8; float newton:contactMargin = 0.01; uniform bool physics:startsAsleep = 1;"
+    )
+    ignored = read(body(content=content)).report.ignored
+    assert {i.what for i in ignored} == {
+        "physics:startsAsleep",
+        "physxRigidBody:disableGravity, physxRigidBody:linearDamping",
+        "newton:contactMargin",
+    }
+    many = read(*(body(f"B{i}", content) for i in range(20))).report.ignored
+    assert len(many) == 3
+    assert all("and on 19 more prims" in i.what for i in many)
+
+
+def test_attributes_without_their_schema_are_reported():
+    ignored = read(body(content="float physics:mass = 4;", apis=(BODY,))).report.ignored
+    assert [(i.path, i.what) for i in ignored] == [("/B", "physics:mass")]
+
+
+# -- errors ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("scene", "parts"),
+    [
+        ("no/such/file.usda", ["no/such/file.usda: no such file", "check the path"]),
+        ("box_on_grond", ["box_on_grond: no file and no shipped scene", "did you mean the shipped scene 'box_on_ground'?", "stack"]),
+        ("box_on_ground.usd", ["no such file", "'box_on_ground'"]),
+        (Path("zzz"), ["zzz: no file and no shipped scene", "shipped: belt, box_on_ground"]),
+        (7, ["a scene is a path", "not int"]),
+    ],
+)
+def test_scene_that_does_not_exist(scene, parts):
+    with pytest.raises(wl.SceneError) as caught:
+        wl.load_usd(scene)
+    for part in parts:
+        assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ['#usda 1.0\ndef Xform "A" {\n    double x = \n}\n', "hello\n", ""])
+def test_broken_file(tmp_path, text):
+    path = tmp_path / "broken.usda"
+    path.write_text(text)
+    with pytest.raises(wl.SceneError, match=r"broken\.usda: not a readable USD file: ") as caught:
+        wl.load_usd(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_folder_is_no_scene(tmp_path):
+    with pytest.raises(wl.SceneError, match="is a folder"):
+        wl.load_usd(tmp_path)
+
+
+def test_path_and_string_read_the_same_file(tmp_path):
+    path = tmp_path / "one.usda"
+    path.write_text(layer(SCENE, body()))
+    assert wl.load_usd(path).report.source == wl.load_usd(str(path)).report.source == str(path)
+
+
+def test_stage_without_physics_and_stage_where_nothing_moves():
+    assert "no physics in this stage" in refused(prim("Cube", "C"))
+    message = refused(cube("Ground"))
+    assert "nothing can move" in message
+    assert "/Ground" in message
+
+
+def test_broken_reference_is_refused():
+    message = refused(body(), prim("Xform", "R", (), "", "prepend references = @missing.usda@"))
+    assert "broken reference /R" in message
+    assert "missing.usda" in message
+
+
+def test_bad_numbers_name_the_prim():
+    assert "/Flat" in refused(body(), cube("Flat", size=0))
+    assert "/B/C" in refused(material("float physics:staticFriction = -1; float physics:dynamicFriction = -1;"), body(inner=bound_cube()))
+    nan = "vector3f physics:velocity = (nan, 0, 0);"
+    assert "velocity" in refused(body("Wild", nan))
+
+
+def test_missing_extra(monkeypatch):
+    real = builtins.__import__
+
+    def without_pxr(name, *args, **kwargs):
+        if name.partition(".")[0] == "pxr":
+            raise ImportError("No module named 'pxr'")
+        return real(name, *args, **kwargs)
+
+    for name in [m for m in sys.modules if m.partition(".")[0] == "pxr"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(builtins, "__import__", without_pxr)
+    with pytest.raises(wl.MissingExtra, match=r"reading USD scenes needs the extra 'usd': python -m pip install 'warp_lcp\[usd\]'"):
+        wl.load_usd("stack")
+
+
+# -- shipped scenes -------------------------------------------------------------------------------------------------
+
+
+def test_every_shipped_scene_says_what_it_shows_and_loads_without_remarks():
+    from pxr import Sdf
+
+    assert set(scenes.names()) == {"belt", "box_on_ground", "heavy_on_light", "incline", "spinning_box", "sphere_slip_roll", "stack"}
+    for name in scenes.names():
+        root = Sdf.Layer.FindOrOpen(str(scenes.path(name)))
+        assert "Expected:" in root.documentation
+        model = wl.load_usd(name)
+        assert (model.report.notes, model.report.ignored) == ((), ())
+        assert model.gravity == pytest.approx([0, 0, -9.81], abs=1e-12)
+        assert model.up_axis == "Z"
+
+
+def test_box_on_ground_is_table_1_of_the_paper():
+    model = wl.load_usd("box_on_ground")
+    assert model.body_names == ("/World/Box",)
+    assert "/World/Ground" in model.shape_names
+    assert model.mass.tolist() == [1.0]
+    assert model.inertia[0] == pytest.approx(np.eye(3) / 6, abs=1e-15)
+    assert model.q0 == pytest.approx([0, 0, 0.5, 0, 0, 0, 1], abs=1e-15)
+    assert model.v0 == pytest.approx([0, 5, 0, 0, 0, 2 * math.pi], abs=1e-14)
+    assert model.shape_size[0].tolist() == [0.5] * 3
+    assert model.friction.tolist() == [[1, 1]] * 2
+    assert model.contact == pytest.approx(np.array([[1e10, 1e8, 1e8, 1e5, 1e-3]] * 2), rel=1e-12)
+
+
+def test_incline():
+    model = wl.load_usd("incline")
+    x, y, z, w = model.q0[3:7]
+    down = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])  # the slope's x axis
+    assert -down[2] / down[0] == pytest.approx(0.6, rel=1e-12)
+    assert model.friction.tolist() == [[0.5, 0.5], [0.5, 0.5], [0.9, 0.9]]
+    mean = model.friction[1:, 1] / 2 + model.friction[0, 1] / 2
+    assert mean.tolist() == pytest.approx([0.5, 0.7])
+    assert model.mass.tolist() == [8, 8]
+
+
+@pytest.mark.parametrize(("name", "masses"), [("heavy_on_light", [8, 8000]), ("stack", [8] * 10)])
+def test_stacks_touch_and_rest(name, masses):
+    model = wl.load_usd(name)
+    assert model.mass.tolist() == masses
+    assert model.q0.reshape(-1, 7)[:, 2] == pytest.approx([0.1 + 0.2 * i for i in range(len(masses))], abs=1e-15)
+    assert not model.v0.any()
+    assert (model.friction == 0.5).all()
+    assert model.inertia[0] == pytest.approx(8 * 0.04 / 6 * np.eye(3))
+
+
+def test_spinning_box_sphere_and_belt():
+    spin = wl.load_usd("spinning_box")
+    assert spin.v0 == pytest.approx([0, 0, 0, 0, 0, 2 * math.pi])
+    assert (spin.mass.tolist(), spin.friction.tolist()) == ([1], [[1, 1]] * 2)
+    ball = wl.load_usd("sphere_slip_roll")
+    assert ball.v0.tolist() == [2, 0, 0, 0, 0, 0]
+    assert ball.inertia[0] == pytest.approx(0.004 * np.eye(3))
+    assert ball.shape_size[ball.shape_type == ShapeType.SPHERE, 0].tolist() == [0.1]
+    assert ball.friction.tolist() == [[0.3, 0.3]] * 2
+    belt = wl.load_usd("belt")
+    static = int(np.flatnonzero(belt.shape_body < 0)[0])
+    assert belt.shape_surface_velocity[static].tolist() == [1, 0, 0]
+    assert not belt.v0.any()
+    assert belt.q0[2] - 0.1 == pytest.approx(belt.shape_pose[static, 2] + belt.shape_size[static, 2], abs=1e-15)
+
+
+# -- scenes of others -----------------------------------------------------------------------------------------------
+
+#: Files that can be simulated: bodies, mass [kg], pairs.
+LOADED = {
+    "converted/muc_contact_excludes/contact_excludes.usdc": (4, 108.0, 7),
+    "newton/ex_palletizer_scene.usda": (7, 102.0, 35),
+    "newton/kamino_box_on_plane.usda": (1, 1.0, 1),
+    "openusd/usdPhysicsBoxOnBox.usda": (1, 15.625, 1),
+    "openusd/usdPhysicsDistanceJoint.usda": (1, 10.0, 1),
+    "openusd/usdPhysicsGroupFiltering.usda": (2, 31.25, 2),
+    "openusd/usdPhysicsPairFiltering.usda": (2, 31.25, 2),
+    "ovphysx_bsd/basic_simulation.usda": (1, 10.0, 0),
+    "ovphysx_bsd/clone_with_root_transforms.usda": (1, 1.0, 0),
+    "ovphysx_bsd/heterogeneous_clone.usda": (3, 8.5, 3),
+    "ovphysx_bsd/simple_physics_scene.usda": (4, 4.5, 9),
+}
+NO_PHYSICS = {"newton/ex_crazyflie.usd", "ovphysx_bsd/api_surface_permutations.usda"}
+
+
+def corpus():
+    files = (p for p in SHARED.rglob("*.usd*") if "Payload" not in p.parts)
+    return sorted(p.relative_to(SHARED).as_posix() for p in files)
+
+
+def refusable(path):
+    """Prims of a file that cannot be simulated, found by looking at the stage rather than by the loader."""
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    source = Usd.Stage.Open(str(path))
+    found = set()
+    for p in Usd.PrimRange.Stage(source, Usd.TraverseInstanceProxies()):
+        collider = p.HasAPI(UsdPhysics.CollisionAPI) and p.IsA(UsdGeom.Gprim)
+        body_above = next((a for a in chain(p) if a.HasAPI(UsdPhysics.RigidBodyAPI)), None)
+        odd_shape = collider and (p.GetTypeName() not in ("Cube", "Sphere", "Plane") or "ellipsoid" in p.GetName())
+        flying_plane = collider and p.GetTypeName() == "Plane" and body_above
+        massless = p.HasAPI(UsdPhysics.RigidBodyAPI) and not massive(p)
+        if p.IsA(UsdPhysics.Joint) or odd_shape or flying_plane or massless:
+            found.add(str(p.GetPath()))
+    return found
+
+
+def chain(p):
+    while p and not p.IsPseudoRoot():
+        yield p
+        p = p.GetParent()
+
+
+def massive(p):
+    """Whether a mass or a collider of its own gives the body mass."""
+    from pxr import Usd, UsdPhysics
+
+    def owned(q):
+        return next((a for a in chain(q) if a.HasAPI(UsdPhysics.RigidBodyAPI)), None) == p
+
+    if p.HasAPI(UsdPhysics.MassAPI) and p.GetAttribute("physics:mass").Get() > 0:
+        return True
+    inner = Usd.PrimRange(p, Usd.TraverseInstanceProxies())
+    return any(q.HasAPI(UsdPhysics.CollisionAPI) and owned(q) for q in inner)
+
+
+@needs_shared
+def test_the_whole_corpus_is_there():
+    assert len(corpus()) == 52
+
+
+@needs_shared
+@pytest.mark.parametrize("name", corpus() if SHARED.is_dir() else [])
+def test_scenes_of_others(name):
+    reading = read_usd(SHARED / name)
+    unsupported = {i.path for i in reading.report.unsupported}
+    assert unsupported == refusable(SHARED / name)
+    if name in LOADED:
+        bodies, mass, pairs = LOADED[name]
+        model = wl.load_usd(SHARED / name)
+        assert not unsupported
+        assert (model.num_bodies, len(model.pairs)) == (bodies, pairs)
+        assert reading.mass == pytest.approx(mass, rel=1e-6)
+        return
+    with pytest.raises(wl.SceneError) as caught:
+        wl.load_usd(SHARED / name)
+    message = str(caught.value)
+    assert message.startswith(f"{SHARED / name}: ")
+    assert "\n" not in message
+    if name in NO_PHYSICS:
+        assert "no physics in this stage" in message
+    elif len(unsupported) <= 100:
+        assert all(path in message for path in unsupported)
+
+
+#: What each refused OpenUSD example is refused for, read off the files by eye.
+REFUSED = {
+    "usdPhysicsBoxOnQuad.usda": ["/World/Ground"],
+    "usdPhysicsJoints.usda": ["/World/D6Joint"],
+    "usdPhysicsNestedArticulation.usda": ["/Hinge/Body1/Body2/PhysicsRevoluteJoint", "/Hinge/Body1/PhysicsFixedJoint"],
+    "usdPhysicsSpheresWithMaterial.usda": ["/World/Ground"],
+}
+
+
+@needs_shared
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused_openusd_examples(name):
+    assert [i.path for i in read_usd(SHARED / "openusd" / name).report.unsupported] == REFUSED[name]
+
+
+@needs_shared
+def test_openusd_examples_in_si():
+    model = wl.load_usd(SHARED / "openusd/usdPhysicsBoxOnBox.usda")
+    assert model.gravity == pytest.approx([0, 0, -9.81])
+    assert model.v0 == pytest.approx([0.02, 0.01, 0.02, math.radians(1), 0, 0])
+    assert model.q0[:3] == pytest.approx([0, 0, 5])
+    assert model.shape_size[1] == pytest.approx([7.5, 7.5, 0.1])  # size 2 scaled by 750, 750, 10 cm
+    for name in ("Group", "Pair"):
+        model = wl.load_usd(SHARED / f"openusd/usdPhysics{name}Filtering.usda")
+        assert model.mass == pytest.approx([15.625] * 2, rel=1e-6)
+        assert (model.shape_body[model.pairs] < 0).any(axis=1).all()  # each box touches the ground, not the other box
+    joint = wl.load_usd(SHARED / "openusd/usdPhysicsDistanceJoint.usda").report.ignored
+    assert [(i.path, i.what) for i in joint] == [("/World/DistanceJoint", "DistancePhysicsJoint")]
+
+
+@needs_shared
+@pytest.mark.parametrize(
+    ("name", "mass"),
+    [("converted/go1/go1.usda", 12.74), ("converted/quadruped_urdf/quadruped.usda", 30.7), ("newton/ex_humanoid.usda", 40.84),
+     ("ovphysx_bsd/links_chain_sample.usda", 214.8), ("ovphysx_bsd/two_articulations.usda", 85.9), ("newton/ant.usda", 0.1822)],
+)  # fmt: skip
+def test_total_mass_agrees_with_newton(name, mass):
+    """The masses of shared/usd/README.md, to the digits given there."""
+    assert read_usd(SHARED / name).mass == pytest.approx(mass, rel=6e-4)
