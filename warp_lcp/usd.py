@@ -314,7 +314,7 @@ class _Reader:
         if not self.stage.HasAuthoredMetadata("upAxis"):
             self.notes.append("upAxis is not authored: Y, as USD prescribes")
         self.scenes = [(p, d) for p, d in self._descs("Scene")]
-        self.builder = ModelBuilder(self._gravity(up), up)
+        self.builder = ModelBuilder(self._gravity(up).tolist(), up)
         self._composition_errors()
         body_descs = self._owned([(p, d) for p, d in self._descs("RigidBody") if self._enabled(p, d)])
         shape_descs = [(p, d) for kind in self._kinds("Shape") for p, d in self._descs(kind)]
@@ -327,11 +327,11 @@ class _Reader:
             self._shape(path, desc)
         joints = self._joints()
         self._filter()
-        self._other_prims(joints)
+        self._other_prims()
         if self.unbound:
             self.notes.append(f"no physics material on {_some(self.unbound)}: friction 0.5 / 0.5, no restitution")
         self._diagnostics(delegate)
-        gravity = tuple(float(x) for x in self.builder.gravity)
+        gx, gy, gz = self.builder.gravity.tolist()
         return SceneReading(
             source=self.source,
             builder=self.builder,
@@ -340,7 +340,7 @@ class _Reader:
             shapes=tuple(str(p) for p, _ in active),
             joints=tuple(str(p) for p in joints),
             mass=None if None in self.masses else float(sum(self.masses)),  # type: ignore[arg-type]
-            gravity=gravity,
+            gravity=(gx, gy, gz),
             up_axis=up,
             meters_per_unit=self.length,
             kilograms_per_unit=self.mass_unit,
@@ -598,7 +598,7 @@ class _Reader:
             elif kind == "SphereShape":
                 shape = self.builder.add_sphere(index, self.length * self._radius(prim) * frame.scale.max(), **options)
             else:
-                shape = self.builder.add_box(index, self.length * self._half_extents(prim, frame), **options)
+                shape = self.builder.add_box(index, (self.length * self._half_extents(prim, frame)).tolist(), **options)
         except ModelError as error:
             self.unsupported.append(Ignored(str(path), f"{prim.GetTypeName()} collider", str(error).removeprefix(f"{path}: ")))
         else:
@@ -752,7 +752,7 @@ class _Reader:
                 self.ignored.append(Ignored(str(path), "articulation root", "no enabled joint belongs to it"))
         return enabled
 
-    def _other_prims(self, joints: list[Any]) -> None:
+    def _other_prims(self) -> None:
         skip = None  # subtree of a point instancer
         for prim in self.prims:
             path = prim.GetPath()
