@@ -250,8 +250,9 @@ def make(real):
                 belt = surface_velocity(topology, bodies, env, shape_b) - surface_velocity(topology, bodies, env, shape_a)
                 u_free = point_velocity(bodies.free_velocity, bodies.com, env, body_b, point) + belt
                 u_free -= point_velocity(bodies.free_velocity, bodies.com, env, body_a, point)
-                # A row where the gap could close within the step: h times the approach speed, and a margin.
-                if phi < h * wp.max(-wp.dot(slots.normal[env, slot], u_free), real(0.0)) + fall:
+                # A row where the gap could close within the step. The speed counts, not just its approaching part: an
+                # impact elsewhere on the body turns one into the other (1.1 mm of overlap at 1 ms without, 3 um with).
+                if phi < h * wp.length(u_free) + fall:
                     if count < contacts.slot.shape[1]:
                         u = point_velocity(bodies.velocity, bodies.com, env, body_b, point) + belt
                         u -= point_velocity(bodies.velocity, bodies.com, env, body_a, point)
