@@ -106,7 +106,7 @@ def make(real) -> SimpleNamespace:
         energy = real(0.0)
         finite = bool(True)
         for b in range(next_velocity.shape[1]):
-            finite = finite and wp.isfinite(next_velocity[env, b])
+            finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
         for i in range(r):
             p = contacts.impulse[env, i]
             eps = contacts.relaxation[env, i]

@@ -18,6 +18,8 @@ from .types import FACETS, OVERFLOW, REGULARIZED, scalar_types
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
 # A contact that opens by more than this many static deflections under its weight has separated.
 ELASTIC_RANGE = wp.constant(10.0)
+# A predicted slip under this part of the free velocity is round-off and has no direction.
+NO_SLIP = wp.constant(1.0e-6)
 # The last normal impulse that eq. 43 divides by is at least this part of the contact's weight.
 IMPULSE_FLOOR = wp.constant(1.0e-2)
 # Table 1 per kilogram of the lighter movable body (warp_lcp.model.TABLE_1), in the order of Parameters.contact.
@@ -78,15 +80,23 @@ def row_functions(real) -> SimpleNamespace:
         return result
 
     @wp.func
+    def tangent_part(x: vec3, n: vec3) -> vec3:
+        return x - n * wp.dot(n, x)
+
+    @wp.func
     def any_tangent(n: vec3) -> vec3:
         """World x (or y where the normal is near x) projected on the tangent plane."""
         axis = vec3(real(1.0), real(0.0), real(0.0))
         if wp.abs(n[0]) > real(0.9):
             axis = vec3(real(0.0), real(1.0), real(0.0))
-        return wp.normalize(axis - n * wp.dot(n, axis))
+        return wp.normalize(tangent_part(axis, n))
 
     return SimpleNamespace(
-        point_velocity=point_velocity, side_mobility=side_mobility, contact_parameters=contact_parameters, any_tangent=any_tangent
+        point_velocity=point_velocity,
+        side_mobility=side_mobility,
+        contact_parameters=contact_parameters,
+        tangent_part=tangent_part,
+        any_tangent=any_tangent,
     )
 
 
@@ -97,12 +107,8 @@ def make(real):
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     f = row_functions(real)
-    point_velocity, side_mobility, contact_parameters, any_tangent = (
-        f.point_velocity,
-        f.side_mobility,
-        f.contact_parameters,
-        f.any_tangent,
-    )
+    point_velocity, side_mobility, contact_parameters = f.point_velocity, f.side_mobility, f.contact_parameters
+    tangent_part, any_tangent = f.tangent_part, f.any_tangent
     shape_pose = pair_functions(real).shape_pose
 
     @wp.func
@@ -159,7 +165,7 @@ def make(real):
         if touched:
             impulse = slots.last_impulse[env, slot]
             bristle = slots.last_bristle[env, slot]
-            bristle -= n * wp.dot(n, bristle)
+            bristle = tangent_part(bristle, n)
 
         # Normal row. Eqs. 40 and 41 while the surfaces touch; an open gap only may not close by more than itself.
         # Compliance moves surfaces in contact apart and together by the deflection under their load, so one that
@@ -172,7 +178,7 @@ def make(real):
             d_n = wp.max(eps_n * h * k_n * phi, -real(MAX_DEPENETRATION_SPEED))
 
         eps_t = real(1.0) / (k_t * h * h + b_t * h)
-        slip = u - n * wp.dot(n, u)
+        slip = tangent_part(u, n)
         speed = wp.length(slip)
         slides = speed >= c[4]
         mu = friction[0]
@@ -195,14 +201,15 @@ def make(real):
                     mu_row[1] = real(0.0)
             else:
                 # First direction along the slip to come, so that the limit there is mu_s lambda_n exactly.
-                predicted = u_free - n * wp.dot(n, u_free) + d_t
+                predicted = tangent_part(u_free, n) + d_t
                 length = wp.length(predicted)
-                if length > real(0.0):
+                if length > real(NO_SLIP) * wp.length(u_free):
                     t1 = predicted / length
         elif slides:
             d_t = vec3()
         if mu == real(0.0):
             k = 0
+        t1 = wp.normalize(tangent_part(t1, n))  # once more: a small slip is a difference of large numbers
         t2 = wp.cross(n, t1)
         frame = wp.matrix_from_rows(n, t1, t2)
 

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .types import ITERATION_LIMIT, RAY, scalar_types, sync
+from .types import ITERATION_LIMIT, RAY, UNCERTIFIED, sync
 
 
 @functools.cache
@@ -91,8 +91,6 @@ def functions(real) -> SimpleNamespace:
             largest = wp.max(largest, wp.abs(ws.tableau[slot, i, col]))
         tolerance = pivot_tolerance * wp.max(largest, real(1.0))
         bound = real(1.0e30)
-        if wp.static(not double):
-            bound = real(1.0e30)
         for i in range(n):
             p = -ws.tableau[slot, i, col]
             if p > tolerance:
@@ -269,6 +267,7 @@ def make(real):
         M: wp.array3d(dtype=real),
         q: wp.array2d(dtype=real),
         limit: int,
+        tolerance: real,
         ws: LcpWorkspace,
         z: wp.array2d(dtype=real),
         w: wp.array2d(dtype=real),
@@ -299,6 +298,8 @@ def make(real):
                 residual[problem] = worst
                 iterations[problem] = result[1]
                 status[problem] = result[0]
+                if not worst <= tolerance:
+                    status[problem] = result[0] | UNCERTIFIED
             sync()
 
     return solve_batch

@@ -28,7 +28,9 @@ _PUBLIC = {
     "Simulator": "simulator",
     "Status": "simulator",
     "WarpLcpError": "errors",
+    "LCPSolution": "solve",
     "load_usd": "usd",
+    "solve_lcp": "solve",
 }
 __all__ = sorted(_PUBLIC)
 

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Batches: environments are independent to the last bit, failures stay where they are, parameters differ per environment."""
+
+import numpy as np
+import pytest
+import warp as wp
+from conftest import GRAVITY as G
+from conftest import DEVICE, block_on_plane, paper_box, random_quaternions, simulator
+
+import warp_lcp as wl
+
+
+def bits(sim: wl.Simulator) -> np.ndarray:
+    """State of every environment as integers, so that equality means equal bits."""
+    kind = np.uint64 if sim.precision == "float64" else np.uint32
+    return np.concatenate([sim.q.numpy(), sim.v.numpy()], axis=1).view(kind)
+
+
+def randomised(envs: int, which=slice(None), **options) -> wl.Simulator:
+    """Tumbling blocks with their own mass, inertia, friction, gravity and start."""
+    rng = np.random.default_rng(3)
+    model = block_on_plane(0.5, half=(0.2, 0.15, 0.1)).finalize()
+    scale = rng.uniform(0.5, 2.0, (envs, 1))
+    inertia = model.inertia * rng.uniform(0.8, 1.2, (envs, 1, 1, 1)) * scale[..., None, None]
+    mu = np.repeat(rng.uniform(0.1, 1.0, (envs, 1, 1)), 2, axis=1)
+    friction = np.concatenate([mu, 0.8 * mu], axis=2)
+    gravity = np.array([0, 0, -G]) * rng.uniform(0.5, 1.5, (envs, 1))
+    q = np.zeros((envs, 7))
+    q[:, 2], q[:, 3:] = 0.4, random_quaternions(rng, envs)
+    v = rng.normal(size=(envs, 6))
+    pick = np.arange(envs)[which]
+    sim = simulator(model, len(pick), 2e-3, **options)
+    sim.set_parameters(mass=(model.mass * scale)[pick], inertia=inertia[pick], friction=friction[pick], gravity=gravity[pick])
+    sim.q.assign(q[pick])
+    sim.v.assign(v[pick])
+    return sim
+
+
+@pytest.mark.parametrize("method", ["auto", "pgs"])
+def test_equal_environments_stay_equal(method):
+    sim = simulator(paper_box(), 33, 1e-2, method=method)
+    sim.step(80)
+    assert (bits(sim) == bits(sim)[0]).all()
+
+
+@pytest.mark.parametrize("options", [{}, {"method": "pgs", "precision": "float32"}], ids=["auto", "pgs float32"])
+def test_a_batch_is_bit_identical_to_its_environments_alone(options):
+    """1024 environments with their own mu, m, I; then the same alone, in another batch, and the whole once more."""
+    whole = randomised(1024, **options)
+    whole.step(300)
+    again = randomised(1024, **options)
+    again.step(300)
+    assert (bits(whole) == bits(again)).all()
+    assert np.isfinite(whole.q.numpy()).all()
+    for which in ([0], [511], [1023], [100, 7, 900]):
+        alone = randomised(1024, which, **options)
+        alone.step(300)
+        assert (bits(alone) == bits(whole)[which]).all()
+    assert len(np.unique(bits(whole), axis=0)) == 1024
+
+
+def test_steps_one_by_one_equal_steps_together():
+    together, one_by_one = randomised(4), randomised(4)
+    together.step(100)
+    for _ in range(100):
+        one_by_one.step()
+    assert (bits(together) == bits(one_by_one)).all()
+
+
+def test_recorded_steps_equal_eager_steps():
+    """The captured graph and plain launches do the same."""
+    recorded, eager = randomised(4), randomised(4)
+    recorded.step(100)
+    for _ in range(100):
+        eager._step_kernels()
+    assert (bits(recorded) == bits(eager)).all()
+
+
+def test_a_nan_is_flagged_contained_and_healed_by_a_masked_reset():
+    fresh = simulator(paper_box(), 8)
+    fresh.step(50)
+    expected = bits(fresh)[0]
+
+    sim = simulator(paper_box(), 8)
+    sim.step(20)
+    v = sim.v.numpy().copy()
+    v[5, 1] = np.nan
+    sim.v.assign(v)
+    sim.step(30)
+    assert sim.status.numpy()[5] & wl.Status.NOT_A_NUMBER
+    others = np.arange(8) != 5
+    assert (sim.status.numpy()[others] == 0).all()
+    assert (bits(sim)[others] == expected).all()
+
+    sim.reset(~others)
+    sim.step(50)
+    assert sim.status.numpy()[5] == 0
+    assert (bits(sim)[5] == expected).all()
+
+
+@pytest.mark.parametrize(("where", "index"), [("q", 0), ("q", 6), ("v", 0), ("v", 5), ("wrench", 0), ("wrench", 5)])
+def test_no_nan_passes_silently(where, index):
+    sim = simulator(paper_box(), 3)
+    array = getattr(sim, where)
+    values = array.numpy().copy()
+    values.reshape(3, -1)[1, index] = np.inf if where == "wrench" else np.nan
+    array.assign(values)
+    sim.step()
+    assert [bool(s & wl.Status.NOT_A_NUMBER) for s in sim.status.numpy()] == [False, True, False]
+
+
+def test_reset_clears_contact_history():
+    """A reset box repeats its first run to the bit; without clearing bristles and impulses it would not."""
+    sim = simulator(paper_box(), 2, 1e-2)
+    sim.step(40)
+    first = bits(sim)
+    sim.reset()
+    sim.step(40)
+    assert (bits(sim) == first).all()
+
+
+def test_reset_takes_warp_masks_and_new_start_states():
+    sim = simulator(paper_box(), 3)
+    q0 = sim.q0.numpy().copy()
+    q0[:, 0] = [1, 2, 3]
+    sim.q0.assign(q0)
+    sim.step(5)
+    sim.reset(wp.array([True, False, True], dtype=wp.bool, device=DEVICE))
+    assert sim.q.numpy()[[0, 2], 0].tolist() == [1, 3]
+    assert sim.q.numpy()[1, 0] != 2
+    with pytest.raises(wl.WarpLcpError, match=r"mask has shape \(2,\); give \(3,\)"):
+        sim.reset([True, False])
+
+
+def test_changing_the_mass_updates_what_follows_from_it():
+    """Ten times the mass: the same sliding acceleration, ten times the impulse, and the same deflection, for k_n scales."""
+    sim = simulator(block_on_plane(0.5, mass=1.0), 2)
+    sim.step(10)
+    sim.set_parameters(mass=np.array([[1.0], [10.0]]))
+    assert sim.parameters.inertia.numpy()[1, 0] == pytest.approx(10 * sim.parameters.inertia.numpy()[0, 0])
+    sim.wrench.assign(np.tile([0, 0, 0, 0, 0, 0.0], (2, 1, 1)))
+    sim.step(500)
+    impulse = sim.contacts.impulse.numpy()[:, :4, 0].sum(axis=1)
+    assert impulse == pytest.approx([G * 1e-3, 10 * G * 1e-3], rel=1e-6)
+    assert 0.1 - sim.q.numpy()[:, 2] == pytest.approx(np.full(2, G / 4e10), rel=1e-3)
+
+
+def test_parameters_reject_what_no_body_can_have():
+    sim = simulator(paper_box(), 2)
+    for values, message in [
+        ({"mass": [0.0]}, r"mass\[0, 0\] is 0.0; it must be finite and greater than zero"),
+        ({"mass": [[1.0], [np.nan]]}, r"mass\[1, 0\] is nan"),
+        ({"friction": np.full((2, 2), -0.1)}, "it must be finite and not negative"),
+        ({"inertia": -np.eye(3)[None]}, "positive definite"),
+        ({"gravity": [0, 0]}, r"gravity has shape \(2,\); give \(3,\) or \(2, 3\)"),
+        ({"weight": [1.0]}, "'weight' is not a parameter; choose from mass"),
+    ]:
+        with pytest.raises(wl.WarpLcpError, match=message):
+            sim.set_parameters(**values)
+
+
+def test_relaxation_may_differ_between_environments():
+    """Static deflection m g / (4 k_n) for each environment's own stiffness."""
+    sim = simulator(block_on_plane(0.5, mass=1.0), 3)
+    contact = np.full((3, 2, 5), np.nan)
+    contact[:, :, 0] = np.array([1e6, 1e8, 1e10])[:, None]
+    sim.set_parameters(contact=contact)
+    # b_n stays at 1e8 N s/m: the time to settle is b_n / k_n, so start with the deflection already there.
+    q = sim.q.numpy().copy()
+    deflection = G / (4 * np.array([1e6, 1e8, 1e10]))
+    q[:, 2] -= deflection
+    sim.q.assign(q)
+    sim.step(100)
+    assert 0.1 - sim.q.numpy()[:, 2] == pytest.approx(deflection, rel=1e-6)
+
+
+def test_strict_raises_and_names_the_environment():
+    sim = simulator(paper_box(), 4, strict=True)
+    sim.step(3)
+    v = sim.v.numpy().copy()
+    v[2] = np.nan
+    sim.v.assign(v)
+    with pytest.raises(wl.SimulationError, match="1 of 4 environments are not OK .* environment 2, NOT_A_NUMBER"):
+        sim.step()
+
+
+def test_overflow_is_flagged_not_silent():
+    """A block between many planes has more points than 24 a body; the environment says so."""
+    builder = wl.ModelBuilder()
+    for _ in range(8):
+        builder.add_plane()
+    body = builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1))
+    builder.add_box(body, (0.1, 0.1, 0.1))
+    model = builder.finalize()
+    assert (model.num_slots, model.max_contacts) == (64, 24)
+    sim = simulator(model)
+    sim.step()
+    assert sim.status.numpy()[0] & wl.Status.OVERFLOW
+    assert sim.contacts.count.numpy()[0] == 24
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"dt": np.nan}, "dt is nan s; it must be finite"),
+        ({"dt": -1e-3}, "greater than zero"),
+        ({"num_envs": 0}, "num_envs is 0; give a whole number of at least 1"),
+        ({"directions": 1}, "directions is 1"),
+        ({"rho_scale": 0.0}, "rho_scale is 0.0"),
+        ({"method": "simplex"}, "method is 'simplex'; choose one of auto, lemke, pgs"),
+        ({"precision": "half"}, "choose one of float64, float32"),
+        ({"formulation": "magic"}, "choose one of phantom_inertia"),
+        ({"sliding": "no"}, "choose one of regularized, aligned, facets"),
+        ({"integrator": "rk4"}, "choose one of euler"),
+    ],
+)
+def test_arguments_are_checked(arguments, message):
+    with pytest.raises(wl.WarpLcpError, match=message):
+        simulator(paper_box(), **arguments)

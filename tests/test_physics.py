@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contact scenes against closed forms. g = 9.81 m/s^2 throughout."""
+
+import numpy as np
+import pytest
+from conftest import GRAVITY as G
+from conftest import block_on_plane, random_quaternions, simulator, yaw
+
+import warp_lcp as wl
+from warp_lcp.builder import rotation_matrix
+
+MU = 0.5
+
+
+def incline(degrees_over: float, heading: float) -> wl.ModelBuilder:
+    """Block on a slope of atan(mu) + degrees_over, downhill at `heading` degrees to the world's x axis."""
+    slope, turn = np.arctan(MU) + np.radians(degrees_over), np.radians(heading)
+    downhill = np.array([np.cos(turn), np.sin(turn), 0.0])
+    return block_on_plane(MU, gravity=G * (np.sin(slope) * downhill - np.cos(slope) * np.array([0, 0, 1.0])))
+
+
+@pytest.mark.parametrize("heading", [0.0, 22.5, 45.0])
+def test_incline_sticks_below_the_friction_angle(heading):
+    """0.1 degree below: over 10 s of sticking the creep is under 1e-6 mm/s."""
+    sim = simulator(incline(-0.1, heading))
+    sim.step(1000)
+    before = sim.q.numpy()[0, :3].copy()
+    sim.step(9000)
+    assert np.linalg.norm(sim.q.numpy()[0, :3] - before) / 9.0 < 1e-9
+    assert sim.status.numpy()[0] == 0
+
+
+@pytest.mark.parametrize("heading", [0.0, 22.5, 45.0])
+@pytest.mark.parametrize("over", [0.1, 10.0])
+def test_incline_slides_above_the_friction_angle(heading, over):
+    """a = g (sin - mu cos), straight downhill, whatever the heading: the discrete law has it exactly, 1e-9 is round-off."""
+    sim = simulator(incline(over, heading))
+    sim.step(1000)
+    slope, turn = np.arctan(MU) + np.radians(over), np.radians(heading)
+    velocity = sim.v.numpy()[0]
+    downhill = velocity[0] * np.cos(turn) + velocity[1] * np.sin(turn)
+    assert downhill == pytest.approx(G * (np.sin(slope) - MU * np.cos(slope)), rel=1e-9)
+    assert abs(velocity[1] * np.cos(turn) - velocity[0] * np.sin(turn)) < 1e-9
+
+
+def test_static_friction_holds_more_than_dynamic():
+    """mu_s = 0.6, mu_k = 0.4 on tan = 0.5: rests if it starts at rest, keeps sliding if it starts fast."""
+    slope = np.arctan(0.5)
+    gravity = (G * np.sin(slope), 0, -G * np.cos(slope))
+    for start, acceleration in ((0.0, 0.0), (1.0, G * (np.sin(slope) - 0.4 * np.cos(slope)))):
+        builder = wl.ModelBuilder(gravity=gravity)
+        material = wl.Material(0.6, 0.4)
+        builder.add_plane(material=material)
+        body = builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1), velocity=(start, 0, 0))
+        builder.add_box(body, (0.1, 0.1, 0.1), material=material)
+        sim = simulator(builder)
+        sim.step(500)
+        assert sim.v.numpy()[0, 0] == pytest.approx(start + 0.5 * acceleration, abs=1e-9)
+
+
+def test_pair_friction_is_the_average():
+    """mu 0.2 on mu 0.6 slides on tan = 0.5 with mu = 0.4."""
+    slope = np.arctan(0.5)
+    builder = wl.ModelBuilder(gravity=(G * np.sin(slope), 0, -G * np.cos(slope)))
+    builder.add_plane(material=wl.Material(0.2, 0.2))
+    body = builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1))
+    builder.add_box(body, (0.1, 0.1, 0.1), material=wl.Material(0.6, 0.6))
+    sim = simulator(builder)
+    sim.step(100)
+    assert sim.v.numpy()[0, 0] == pytest.approx(0.1 * G * (np.sin(slope) - 0.4 * np.cos(slope)), rel=1e-9)
+
+
+def test_frictionless_block_never_stops():
+    """mu = 0: one row a contact, no friction rows, the speed stays to the last bits."""
+    sim = simulator(block_on_plane(0.0, velocity=(1.0, 0.5, 0.0)))
+    sim.step(200)
+    assert sim.v.numpy()[0] == pytest.approx([1.0, 0.5, 0, 0, 0, 0], abs=1e-12)
+    assert sim.q.numpy()[0, :2] == pytest.approx([0.2, 0.1], abs=1e-12)
+
+
+@pytest.mark.parametrize("h", [1e-2, 1e-3])
+def test_sphere_slips_then_rolls(h):
+    """v = 5/7 v0 and omega = v / R from then on, at any step size: angular momentum about the ground is conserved.
+
+    1e-6: the bristles at the slip-stick transition give back a few 1e-9 m/s.
+    """
+    builder = wl.ModelBuilder()
+    material = wl.Material(0.3, 0.3)
+    builder.add_plane(material=material)
+    body = builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1), velocity=(2, 0, 0))
+    builder.add_sphere(body, 0.1, material=material)
+    sim = simulator(builder, dt=h)
+    sim.step(round(0.1 / h))
+    assert sim.v.numpy()[0, 0] == pytest.approx(2 - 0.3 * G * 0.1, abs=1e-6)  # still slipping
+    sim.step(round(0.4 / h))
+    velocity = sim.v.numpy()[0]
+    assert velocity[0] == pytest.approx(10 / 7, rel=1e-6)
+    assert velocity[4] * 0.1 == pytest.approx(velocity[0], rel=1e-6)
+
+
+def test_spinning_box_stops_at_first_order():
+    """omega_z = 2 pi, mu = 1: stops after 0.4742687 rad; Richardson extrapolation within 1e-4 rad, order 1 within 5 %."""
+    exact = 0.4742687
+    steps = np.array([4e-3, 2e-3, 1e-3, 5e-4])
+    angles = []
+    for h in steps:
+        builder = block_on_plane(1.0, half=(0.5, 0.5, 0.5), mass=1.0, angular_velocity=(0, 0, 2 * np.pi))
+        sim = simulator(builder, dt=h)
+        sim.step(round(0.3 / h))
+        angles.append(yaw(sim.q.numpy()[0]))
+    errors = np.abs(np.array(angles) - exact)
+    assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(1.0, abs=0.05)
+    assert 2 * angles[-1] - angles[-2] == pytest.approx(exact, abs=1e-4)
+
+
+@pytest.mark.parametrize("h", [1e-2, 1e-3])
+def test_dropped_box_feels_no_force_before_it_touches(h):
+    """Free fall to round-off while the gap lasts; it lands in the step in which the gap closes, and stays down."""
+    sim = simulator(block_on_plane(half=(0.5, 0.5, 0.5)), dt=h)
+    sim.q0.assign(np.array([[0, 0, 1.5, 0, 0, 0, 1.0]]))
+    sim.reset()
+    velocity, height = 0.0, 1.5
+    while height + h * (velocity - G * h) > 0.5:
+        velocity -= G * h
+        height += h * velocity
+        sim.step()
+        assert sim.v.numpy()[0, 2] == pytest.approx(velocity, abs=1e-12)
+        assert (sim.contacts.impulse.numpy()[0, : sim.contacts.count.numpy()[0], 0] == 0).all()
+    lowest = 1.0
+    for _ in range(round(0.2 / h)):
+        sim.step()
+        lowest = min(lowest, sim.q.numpy()[0, 2])
+    # Static deflection m g / (4 k_n), and no more than 1e-7 m while it settles.
+    deflection = G / (4 * 1e10)
+    assert 0.5 - lowest < 1e-7
+    assert sim.q.numpy()[0, 2] == pytest.approx(0.5 - deflection, abs=1e-12)
+
+
+def test_torque_free_flip_gains_no_energy():
+    """I = (.1, .2, .3), w = (.001, 5, 0), h = 5 ms, 10 s: scene 23. The midpoint rule keeps the energy to round-off.
+
+    w(10 s) from an ODE solver at rtol 1e-13; the rule is of second order: errors at 5 and 2.5 ms in ratio 4 (20 %).
+    """
+    inertia, start = np.diag([0.1, 0.2, 0.3]), np.array([1e-3, 5.0, 0.0])
+    exact = np.array([3.63153, -3.43684, 2.09669])
+    errors = []
+    for h in (5e-3, 2.5e-3):
+        builder = wl.ModelBuilder(gravity=(0, 0, 0))
+        builder.add_body(angular_velocity=start, mass=1.0, inertia=inertia)
+        sim = simulator(builder, dt=h)
+        energy = []
+        for _ in range(round(1.0 / h)):
+            sim.step(10)
+            w = rotation_matrix(sim.q.numpy()[0, 3:]).T @ sim.v.numpy()[0, 3:]
+            energy.append(0.5 * w @ inertia @ w)
+        energy = np.array(energy)
+        assert np.abs(energy / (0.5 * start @ inertia @ start) - 1).max() < 1e-10
+        errors.append(np.linalg.norm(w - exact))
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
+
+
+@pytest.mark.parametrize("kind", ["surface velocity", "kinematic body"])
+def test_belt_carries_a_box(kind):
+    """mu g t while it slips (to bristle round-off), the belt's speed afterwards."""
+    builder = wl.ModelBuilder()
+    material = wl.Material(0.5, 0.5)
+    if kind == "surface velocity":
+        builder.add_box(-1, (5, 1, 0.1), pose=(0, 0, -0.1, 0, 0, 0, 1), material=material, surface_velocity=(1, 0, 0))
+    else:
+        belt = builder.add_body("belt", joint=wl.JointType.KINEMATIC, velocity=(1, 0, 0))
+        builder.add_box(belt, (5, 1, 0.1), pose=(0, 0, -0.1, 0, 0, 0, 1), material=material)
+    body = builder.add_body("box", pose=(0, 0, 0.1, 0, 0, 0, 1))
+    builder.add_box(body, (0.1, 0.1, 0.1), material=material)
+    sim = simulator(builder)
+    sim.step(100)
+    assert sim.body_velocity.numpy()[0, -1, 0] == pytest.approx(0.5 * G * 0.1, rel=1e-6)
+    sim.step(400)
+    assert sim.body_velocity.numpy()[0, -1, 0] == pytest.approx(1.0, abs=1e-6)
+    if kind == "kinematic body":
+        assert sim.body_pose.numpy()[0, 0, 0] == pytest.approx(0.5, abs=1e-12)  # it moves itself, undisturbed
+
+
+@pytest.mark.parametrize(("ratio", "bar"), [(1.0, 2e-5), (1e3, 2e-5), (1e6, 5.5e-4)])
+def test_heavy_box_on_light_box(ratio, bar):
+    """Two 0.2 m boxes, bottom 8 kg, top 8 kg x ratio, dt 5 ms, 2 s: static compliance and nothing else.
+
+    Both contact layers deflect by their load over 4 k_n, k_n = 8e10 N/m: 0.49 um at 1000:1, 0.49 mm at 1e6:1.
+    """
+    builder = wl.ModelBuilder()
+    builder.add_plane()
+    for k, mass in enumerate((8.0, 8.0 * ratio)):
+        body = builder.add_body(pose=(0, 0, 0.1 + 0.2 * k, 0, 0, 0, 1), mass=mass)
+        builder.add_box(body, (0.1, 0.1, 0.1))
+    sim = simulator(builder, dt=5e-3)
+    worst = 0
+    for _ in range(400):
+        sim.step()
+        worst |= int(sim.status.numpy()[0])
+    top = sim.body_pose.numpy()[0, 1]
+    deflection = 8 * G * (ratio + 1) / (4 * 8e10) + 8 * G * ratio / (4 * 8e10)
+    assert worst == 0
+    assert 0.3 - top[2] == pytest.approx(deflection, rel=1e-3)
+    assert 0.3 - top[2] < bar
+    assert np.linalg.norm(top[:2]) < 1e-4
+
+
+def test_crossed_beams_come_to_rest_on_their_edges():
+    """A beam with its edges up carries a block across: edges against edges, no face is vertical or horizontal."""
+    turn = (np.sin(np.pi / 8), 0.0, 0.0, np.cos(np.pi / 8))
+    across = (0.0, np.sin(np.pi / 8), 0.0, np.cos(np.pi / 8))
+    builder = wl.ModelBuilder()
+    for y in (-0.6, 0.6):  # two rails along x, edge up at z = 0
+        builder.add_box(-1, (2, 0.3, 0.3), pose=(0, y, -0.3 * np.sqrt(2), *turn))
+    for x in (-0.5, 0.5):  # a sledge: two runners along y, edge down, joined by a plate
+        body = 0 if x > 0 else builder.add_body("sledge", pose=(0, 0, 0.1 * np.sqrt(2) + 1e-3, 0, 0, 0, 1))
+        builder.add_box(body, (0.1, 1.0, 0.1), pose=(x, 0, 0, *across))
+    sim = simulator(builder)
+    sim.step(500)
+    contacts = sim.contacts
+    assert contacts.count.numpy()[0] == 4
+    frame = contacts.frame.numpy()[0, :4]
+    assert np.abs(frame[:, 0, 2]) == pytest.approx(np.ones(4), abs=1e-6)
+    assert sim.q.numpy()[0, :3] == pytest.approx([0, 0, 0.1 * np.sqrt(2)], abs=1e-6)
+    assert np.abs(sim.v.numpy()).max() < 1e-9
+    assert contacts.impulse.numpy()[0, :4, 0].sum() / 1e-3 == pytest.approx(160 * G, rel=1e-6)
+
+
+def test_corner_on_an_edge_comes_to_rest():
+    """A cube dropped with a corner over the edge of a table falls beside it or stays on it, at rest, without overlap."""
+    builder = wl.ModelBuilder()
+    builder.add_plane(pose=(0, 0, -1, 0, 0, 0, 1))
+    builder.add_box(-1, (1, 1, 0.5), pose=(-1, 0, -0.5, 0, 0, 0, 1))
+    body = builder.add_body("cube", pose=(0, 0, 0.5, 0, 0, 0, 1))
+    builder.add_box(body, (0.1, 0.1, 0.1))
+    envs = 32
+    sim = simulator(builder, num_envs=envs)
+    rng = np.random.default_rng(7)
+    start = np.tile(sim.q0.numpy()[:1], (envs, 1))
+    start[:, 0] = rng.uniform(-0.15, 0.1, envs)
+    start[:, 3:] = random_quaternions(rng, envs)
+    sim.q.assign(start)
+    status = np.zeros(envs, dtype=int)
+    for _ in range(30):
+        sim.step(100)
+        status |= sim.status.numpy()
+    assert (status == 0).all()
+    assert np.abs(sim.v.numpy()).max() < 1e-6
+    height = sim.q.numpy()[:, 2]
+    on_table, on_floor = np.abs(height - 0.1) < 1e-6, np.abs(height + 0.9) < 1e-6
+    assert (on_table | on_floor).all()
+    assert on_table.any()
+    assert on_floor.any()
+
+
+def test_tumbling_boxes_lose_energy_and_come_to_rest():
+    """Boxes thrown at random never gain mechanical energy (1e-6 m of height) and lie still in the end."""
+    envs, half = 64, np.array([0.2, 0.15, 0.1])
+    sim = simulator(block_on_plane(0.5, half=half), num_envs=envs, dt=2e-3)
+    rng = np.random.default_rng(1)
+    start = np.zeros((envs, 7))
+    start[:, 2] = 0.6
+    start[:, 3:] = random_quaternions(rng, envs)
+    sim.q.assign(start)
+    sim.v.assign(rng.normal(size=(envs, 6)) * 2)
+    mass, inertia = sim.model.mass[0], sim.model.inertia[0]
+
+    def energy():
+        q, v = sim.q.numpy(), sim.v.numpy()
+        spin = [rotation_matrix(a[3:]).T @ b[3:] for a, b in zip(q, v, strict=True)]
+        return mass * (G * q[:, 2] + 0.5 * (v[:, :3] ** 2).sum(1)) + [0.5 * w @ inertia @ w for w in spin]
+
+    last, status = energy(), 0
+    for _ in range(300):
+        sim.step(5)
+        now = energy()
+        # Free flight with semi-implicit Euler: exact loss of g^2 h^2 / 2 a step, no gain.
+        assert (now - last).max() < mass * G * 1e-6
+        last = now
+        status |= np.bitwise_or.reduce(sim.status.numpy())
+    assert status == 0
+    assert np.abs(sim.v.numpy()).max() < 1e-9
+
+
+def test_applied_wrench_accelerates_the_centre_of_mass():
+    """F / m and T / I in free flight, off-centre mass: the body frame's origin circles, the centre of mass does not."""
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    builder.add_body(mass=2.0, inertia=np.eye(3) * 0.5, com=(0.3, 0, 0))
+    sim = simulator(builder)
+    sim.wrench.assign(np.array([[[4.0, 0, 0, 0, 0, 1.0]]]))
+    sim.step(500)
+    assert sim.v.numpy()[0] == pytest.approx([1.0, 0, 0, 0, 0, 1.0], abs=1e-12)
+    pose = sim.q.numpy()[0]
+    com = pose[:3] + rotation_matrix(pose[3:]) @ [0.3, 0, 0]
+    assert com == pytest.approx([0.3 + 0.25 * 1.002, 0, 0], abs=1e-12)  # sum of h v, semi-implicit
+    assert yaw(pose) == pytest.approx(0.25 * 1.002, abs=1e-12)
