@@ -81,20 +81,22 @@ def polygon(real) -> SimpleNamespace:
         if plane % 2 == 1:
             sign = real(-1.0)
         # A corner that lies on the side keeps its identity, whatever the last bits say.
-        limit = half * real(1.0001)
+        slack = half * real(1.0e-4)
         for k in range(p.count):
             m = (k + 1) % p.count
-            here = sign * p.x[k] - limit
-            there = sign * p.x[m] - limit
+            here = sign * p.x[k] - half
+            there = sign * p.x[m] - half
             if plane >= 2:
-                here = sign * p.y[k] - limit
-                there = sign * p.y[m] - limit
-            if here <= real(0.0):
+                here = sign * p.y[k] - half
+                there = sign * p.y[m] - half
+            keep_here = here <= slack
+            keep_there = there <= slack
+            if keep_here:
                 result = append(result, p.x[k], p.y[k], p.z[k], p.edge[k])
-            if (here <= real(0.0)) != (there <= real(0.0)):
-                s = here / (here - there)
+            if keep_here != keep_there:
+                s = wp.clamp(here / (here - there), real(0.0), real(1.0))
                 edge = p.edge[k]
-                if here <= real(0.0):
+                if keep_here:
                     edge = 4 + plane
                 result = append(
                     result, p.x[k] + s * (p.x[m] - p.x[k]), p.y[k] + s * (p.y[m] - p.y[k]), p.z[k] + s * (p.z[m] - p.z[k]), edge

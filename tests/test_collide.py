@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gap functions against independent geometry: distances by quadratic programming, points and normals on the surfaces."""
+
+import numpy as np
+import pytest
+from conftest import random_quaternions, simulator
+from scipy.optimize import lsq_linear
+
+import warp_lcp as wl
+from warp_lcp.builder import rotation_matrix
+
+SIZE_A, SIZE_B = np.array([0.3, 0.2, 0.1]), np.array([0.15, 0.25, 0.2])
+
+
+def slots(builder: wl.ModelBuilder, q: np.ndarray):
+    """Collision results of every environment: point, normal, gap, feature [E, C]."""
+    sim = simulator(builder, num_envs=len(q))
+    sim.q.assign(q.reshape(len(q), -1))
+    sim.step()
+    return (getattr(sim.slots, name).numpy() for name in ("point", "normal", "gap", "feature"))
+
+
+def box_distance(pose_a, size_a, pose_b, size_b) -> float:
+    """Distance of two boxes [m]: the bounded least-squares problem min |x_a - x_b| over points of the boxes; 0 if they meet."""
+    A, B = rotation_matrix(pose_a[3:]), rotation_matrix(pose_b[3:])
+    result = lsq_linear(np.hstack([A, -B]), pose_b[:3] - pose_a[:3], bounds=(-np.r_[size_a, size_b], np.r_[size_a, size_b]), tol=1e-14)
+    return np.sqrt(2 * result.cost)
+
+
+def inside(point, pose, size, margin) -> bool:
+    """Is a world point within `margin` of a box?"""
+    return bool((np.abs(rotation_matrix(pose[3:]).T @ (point - pose[:3])) <= size + margin).all())
+
+
+def two(add_a, add_b) -> wl.ModelBuilder:
+    """Two free bodies without gravity, each with one shape."""
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    for add in (add_a, add_b):
+        add(builder, builder.add_body())
+    return builder
+
+
+def box(size):
+    return lambda builder, body: builder.add_box(body, size)
+
+
+def sphere(radius):
+    return lambda builder, body: builder.add_sphere(body, radius)
+
+
+def random_poses(rng, envs, reach) -> np.ndarray:
+    q = np.zeros((envs, 2, 7))
+    q[:, 1, :3] = rng.uniform(-reach, reach, (envs, 3))
+    q[:, :, 3:] = random_quaternions(rng, envs, 2)
+    return q
+
+
+def test_box_box_gap_is_a_separating_distance():
+    """Apart: the deepest point's gap is positive and never above the true distance. Overlapping: some gap is negative.
+
+    Each pair that overlaps has points between the boxes (to within the overlap), with unit normals from a to b.
+    """
+    rng = np.random.default_rng(5)
+    q = random_poses(rng, 400, 0.45)
+    point, normal, gap, _ = slots(two(box(SIZE_A), box(SIZE_B)), q)
+    overlapping = apart = 0
+    for e in range(len(q)):
+        distance = box_distance(q[e, 0], SIZE_A, q[e, 1], SIZE_B)
+        real = gap[e] < 1e29
+        if distance > 1e-6:
+            apart += 1
+            assert (gap[e][real] > 0).any() or not real.any()
+        else:
+            overlapping += 1
+            deepest = gap[e][real].min()
+            assert deepest < 1e-9
+            for k in np.flatnonzero(real & (gap[e] <= 0)):
+                assert np.linalg.norm(normal[e, k]) == pytest.approx(1.0, abs=1e-12)
+                margin = 1e-4 - gap[e, k]
+                assert inside(point[e, k], q[e, 0], SIZE_A, margin)
+                assert inside(point[e, k], q[e, 1], SIZE_B, margin)
+            # Moving b out along the normal by the overlap parts the boxes: the normal is a separating direction.
+            moved = q[e, 1].copy()
+            moved[:3] -= normal[e, np.argmin(gap[e])] * (deepest - 1e-6)
+            assert box_distance(q[e, 0], SIZE_A, moved, SIZE_B) > 0
+    assert overlapping > 50
+    assert apart > 50
+
+
+def test_box_on_box_gives_the_four_corners_of_the_overlap():
+    """A small box on a large one, turned by 30 degrees, 1 mm up: its own four corners, gap 1 mm, normal up."""
+    q = np.zeros((1, 2, 7))
+    q[:, :, 6] = 1
+    q[0, 1, 2] = SIZE_A[2] + 0.05 + 1e-3
+    q[0, 1, 5:] = np.sin(np.pi / 12), np.cos(np.pi / 12)
+    point, normal, gap, _ = slots(two(box(SIZE_A), box((0.05, 0.1, 0.05))), q)
+    real = gap[0] < 1e29
+    assert real.sum() == 4
+    assert gap[0][real] == pytest.approx(1e-3)
+    assert normal[0][real] == pytest.approx(np.tile([0, 0, 1.0], (4, 1)))
+    corners = np.array([[x, y] for x in (-0.05, 0.05) for y in (-0.1, 0.1)]) @ rotation_matrix(q[0, 1, 3:])[:2, :2].T
+    found = point[0][real][:, :2]
+    assert sorted(map(tuple, found.round(9))) == sorted(map(tuple, corners.round(9)))
+
+
+def test_overhanging_boxes_clip_to_eight_points():
+    """Equal squares turned by 45 degrees overlap in an octagon."""
+    q = np.zeros((1, 2, 7))
+    q[:, :, 6] = 1
+    q[0, 1, 2] = 0.2
+    q[0, 1, 5:] = np.sin(np.pi / 8), np.cos(np.pi / 8)
+    point, _, gap, feature = slots(two(box((0.1, 0.1, 0.1)), box((0.1, 0.1, 0.1))), q)
+    assert (np.abs(gap[0]) < 1e-12).all()
+    assert len(set(feature[0])) == 8
+    radius = np.linalg.norm(point[0][:, :2], axis=1)
+    assert radius == pytest.approx(np.full(8, 0.1 / np.cos(np.pi / 8)))
+
+
+def test_features_follow_the_corners_while_a_box_slides():
+    """The same corner keeps its feature number over 1000 steps, so its bristles and impulse follow it."""
+    builder = wl.ModelBuilder()
+    builder.add_box(-1, (2, 2, 0.1), pose=(0, 0, -0.1, 0, 0, 0, 1))
+    body = builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1), velocity=(1, 0.3, 0), angular_velocity=(0, 0, 2))
+    builder.add_box(body, (0.1, 0.1, 0.1))
+    sim = simulator(builder)
+    sim.step()
+    first = set(sim.slots.feature.numpy()[0, :4])
+    for _ in range(100):
+        sim.step(10)
+        assert sim.contacts.count.numpy()[0] == 4
+        assert set(sim.slots.last_feature.numpy()[0]) - {-1} == first
+
+
+def test_sphere_box():
+    """Outside: distance to the nearest point of the box (bounded least squares). Inside: out through the nearest face."""
+    rng = np.random.default_rng(6)
+    q = random_poses(rng, 300, 0.4)
+    point, normal, gap, _ = slots(two(sphere(0.1), box(SIZE_A)), q)
+    for e in range(len(q)):
+        local = rotation_matrix(q[e, 1, 3:]).T @ (q[e, 0, :3] - q[e, 1, :3])
+        nearest = np.clip(local, -SIZE_A, SIZE_A)
+        distance = np.linalg.norm(local - nearest) or -(SIZE_A - np.abs(local)).min()
+        assert gap[e, 0] == pytest.approx(distance - 0.1, abs=1e-12)
+        # Moving the sphere back along the normal by the overlap leaves them touching.
+        out = q[e, 0, :3] + normal[e, 0] * gap[e, 0]
+        local = rotation_matrix(q[e, 1, 3:]).T @ (out - q[e, 1, :3])
+        assert np.linalg.norm(local - np.clip(local, -SIZE_A, SIZE_A)) == pytest.approx(0.1, abs=1e-9)
+        assert np.linalg.norm(point[e, 0] - q[e, 0, :3]) == pytest.approx(abs(0.1 + gap[e, 0] / 2), abs=1e-9)
+
+
+def test_spheres_and_planes():
+    rng = np.random.default_rng(7)
+    q = random_poses(rng, 100, 0.4)
+    _, normal, gap, _ = slots(two(sphere(0.1), sphere(0.15)), q)
+    offset = q[:, 1, :3] - q[:, 0, :3]
+    length = np.linalg.norm(offset, axis=1)
+    assert gap[:, 0] == pytest.approx(length - 0.25, abs=1e-12)
+    assert normal[:, 0] == pytest.approx(offset / length[:, None], abs=1e-12)
+
+    tilt = (np.sin(0.2), 0, 0, np.cos(0.2))
+    up = rotation_matrix(np.array(tilt))[:, 2]
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    builder.add_plane(pose=(0.1, 0.2, 0.3, *tilt))
+    builder.add_sphere(builder.add_body(), 0.1)
+    builder.add_box(builder.add_body(), SIZE_A)
+    _, normal, gap, _ = slots(builder, q)
+    height = (q[:, :, :3] - [0.1, 0.2, 0.3]) @ up
+    assert gap[:, 0] == pytest.approx(height[:, 0] - 0.1, abs=1e-12)
+    for e in range(len(q)):
+        corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)]) * SIZE_A
+        world = q[e, 1, :3] + corners @ rotation_matrix(q[e, 1, 3:]).T
+        assert gap[e, 1:9] == pytest.approx((world - [0.1, 0.2, 0.3]) @ up, abs=1e-12)
+    assert normal[:, 1:9] == pytest.approx(np.broadcast_to(up, (len(q), 8, 3)), abs=1e-12)
+
+
+def test_concentric_spheres_part():
+    """No direction is given by geometry; they must still come apart, without NaN."""
+    q = np.zeros((1, 2, 7))
+    q[:, :, 6] = 1
+    sim = simulator(two(sphere(0.1), sphere(0.1)))
+    sim.q.assign(q.reshape(1, -1))
+    sim.step(500)
+    assert sim.status.numpy()[0] == 0
+    pose = sim.body_pose.numpy()[0]
+    assert np.linalg.norm(pose[0, :3] - pose[1, :3]) >= 0.2 - 1e-3
