@@ -110,7 +110,7 @@ def polygon(real) -> SimpleNamespace:
 def make(real):
     """Kernel ``box_box``; launch with dim (E, pairs of boxes)."""
     t = scalar_types(real)
-    vec3, mat33, transform, spatial = t.vec3, t.mat33, t.transform, t.spatial
+    vec3, mat33, transform = t.vec3, t.mat33, t.transform
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f, a, p = pair_functions(real), axes(real), polygon(real)
     shape_pose, write = f.shape_pose, f.write

@@ -104,7 +104,7 @@ def row_functions(real) -> SimpleNamespace:
 def make(real):
     """Kernel ``contact_rows``; launch with dim (E)."""
     t = scalar_types(real)
-    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    vec2, vec3 = t.vec2, t.vec3
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     f = row_functions(real)
     point_velocity, side_mobility, contact_parameters = f.point_velocity, f.side_mobility, f.contact_parameters
@@ -149,7 +149,8 @@ def make(real):
         k_t = c[2]
         b_t = c[3]
         friction = real(0.5) * (
-            parameters.friction[env % parameters.friction.shape[0], shape_a] + parameters.friction[env % parameters.friction.shape[0], shape_b]
+            parameters.friction[env % parameters.friction.shape[0], shape_a]
+            + parameters.friction[env % parameters.friction.shape[0], shape_b]
         )
         mobility = side_mobility(bodies, env, body_a, point) + side_mobility(bodies, env, body_b, point)
         w_nn = wp.dot(n, mobility * n)
@@ -263,9 +264,7 @@ def make(real):
                     if count < contacts.slot.shape[1]:
                         u = point_velocity(bodies.velocity, bodies.com, env, body_b, point) + belt
                         u -= point_velocity(bodies.velocity, bodies.com, env, body_a, point)
-                        write_row(
-                            topology, parameters, bodies, slots, h, sliding, directions, contacts, env, slot, count, u, u_free
-                        )
+                        write_row(topology, parameters, bodies, slots, h, sliding, directions, contacts, env, slot, count, u, u_free)
                         count += 1
                     else:
                         status[env] = status[env] | OVERFLOW

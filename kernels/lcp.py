@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import lemke as lemke_file
-from .types import scalar_types, sync
+from .types import LANES, scalar_types, sync
 
 
 @functools.cache
@@ -180,19 +180,19 @@ def functions(real) -> SimpleNamespace:
                     mu = contacts.mu[env, i][wp.min(m, 1)]
                 lcp.M[slot, si + 1 + m, sj] = mu - g
                 lcp.M[slot, si + 1 + ki + m, sj] = mu + g
-                for l in range(kj):
-                    f = direction(kj, l)
+                for c in range(kj):
+                    f = direction(kj, c)
                     k_ml = real(0.0)
                     for a in range(2):
                         for b in range(2):
                             k_ml += e[a] * ws.A_inv[slot, 2 * fi + a, 2 * fj + b] * f[b]
                     rho = real(0.0)
-                    if i == j and l == m:
+                    if i == j and c == m:
                         rho = rho_scale * k_ml
-                    lcp.M[slot, si + 1 + m, sj + 1 + l] = k_ml
-                    lcp.M[slot, si + 1 + m, sj + 1 + kj + l] = rho - k_ml
-                    lcp.M[slot, si + 1 + ki + m, sj + 1 + l] = rho - k_ml
-                    lcp.M[slot, si + 1 + ki + m, sj + 1 + kj + l] = k_ml
+                    lcp.M[slot, si + 1 + m, sj + 1 + c] = k_ml
+                    lcp.M[slot, si + 1 + m, sj + 1 + kj + c] = rho - k_ml
+                    lcp.M[slot, si + 1 + ki + m, sj + 1 + c] = rho - k_ml
+                    lcp.M[slot, si + 1 + ki + m, sj + 1 + kj + c] = k_ml
         for i in range(lane, r, wp.block_dim()):
             si = ws.start[slot, i]
             fi = ws.friction[slot, i]
@@ -248,7 +248,7 @@ def make(real):
     g = lemke_file.functions(real)
     LcpWorkspace, lemke = g.LcpWorkspace, g.lemke
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
     def lemke_contacts(
         bodies: Bodies,
         contacts: Contacts,

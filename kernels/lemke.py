@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .types import ITERATION_LIMIT, RAY, UNCERTIFIED, sync
+from .types import ITERATION_LIMIT, LANES, RAY, UNCERTIFIED, sync
 
 
 @functools.cache
@@ -262,7 +262,7 @@ def make(real):
     f = functions(real)
     LcpWorkspace, lemke = f.LcpWorkspace, f.lemke
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
     def solve_batch(
         M: wp.array3d(dtype=real),
         q: wp.array2d(dtype=real),

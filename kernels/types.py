@@ -30,6 +30,9 @@ NOT_A_NUMBER = wp.constant(4)
 OVERFLOW = wp.constant(8)
 UNCERTIFIED = wp.constant(16)
 
+# Lanes of a block that works on one environment.
+LANES = 32
+
 # How a sliding contact is discretised (warp_lcp.Simulator, `sliding`).
 REGULARIZED = wp.constant(0)
 ALIGNED = wp.constant(1)

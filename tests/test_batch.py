@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 import warp as wp
-from conftest import GRAVITY as G
 from conftest import DEVICE, block_on_plane, paper_box, random_quaternions, simulator
+from conftest import GRAVITY as G
 
 import warp_lcp as wl
 
@@ -180,7 +180,7 @@ def test_strict_raises_and_names_the_environment():
     v = sim.v.numpy().copy()
     v[2] = np.nan
     sim.v.assign(v)
-    with pytest.raises(wl.SimulationError, match="1 of 4 environments are not OK .* environment 2, NOT_A_NUMBER"):
+    with pytest.raises(wl.SimulationError, match=r"1 of 4 environments are not OK .* environment 2, NOT_A_NUMBER"):
         sim.step()
 
 

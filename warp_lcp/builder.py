@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -69,9 +69,9 @@ def compose_mass(parts: Sequence[tuple[float, np.ndarray, np.ndarray]]) -> tuple
     All in one frame, by the parallel-axis theorem.
     """
     mass = sum(m for m, _, _ in parts)
-    com = sum(m * c for m, c, _ in parts) / mass
-    inertia = sum(i + m * ((c - com) @ (c - com) * np.eye(3) - np.outer(c - com, c - com)) for m, c, i in parts)
-    return mass, com, inertia
+    com = np.sum([m * c for m, c, _ in parts], axis=0) / mass
+    inertia = [i + m * ((c - com) @ (c - com) * np.eye(3) - np.outer(c - com, c - com)) for m, c, i in parts]
+    return mass, com, np.sum(inertia, axis=0)
 
 
 class ModelBuilder:

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from .kernels import lcp, lemke, pgs
+from .kernels.types import LANES
 
 if TYPE_CHECKING:
     from .simulator import Simulator
 
 #: Blocks that solve LCPs at one time on a GPU: enough to fill the largest, each with its own workspace.
 GPU_WORKSPACES = 2048
-#: Lanes of such a block.
-LANES = 32
 
 
 def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
@@ -42,8 +41,6 @@ def workspaces(num_envs: int, device: wp.Device) -> int:
 
 class Lemke:
     """Lemke's method on the assembled LCP of eq. 39, no fallback."""
-
-    block_dim: int | None = LANES
 
     def prepare(self, sim: Simulator) -> None:
         r, real = sim.model.max_contacts, sim.real
@@ -68,7 +65,6 @@ class BlockPGS:
     """Block projected Gauss-Seidel: a fixed number of cold sweeps, fewer where it converges."""
 
     SWEEPS = 50
-    block_dim: int | None = None
 
     def prepare(self, sim: Simulator) -> None:
         self.kernel = pgs.make(sim.real)

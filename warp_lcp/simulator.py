@@ -14,7 +14,7 @@ import warp as wp
 from .errors import SimulationError, WarpLcpError
 from .kernels import bodies, box_box, certify, collide, contacts, reset
 from .kernels.types import scalar_types
-from .methods import LANES, METHODS
+from .methods import METHODS
 from .model import Model, ShapeType
 
 SLIDING = ("regularized", "aligned", "facets")
@@ -210,13 +210,13 @@ class Simulator:
             array = array[None]
         if array.shape not in ((1, *shape), (self.num_envs, *shape)):
             raise WarpLcpError(f"set_parameters: {name} has shape {array.shape}; give {shape} or {(self.num_envs, *shape)}")
-        allowed = np.isfinite(array) | (np.isnan(array) & (name == "contact"))
+        allowed: np.ndarray = np.isfinite(array) | (np.isnan(array) & (name == "contact"))
         if name == "mass":
             allowed &= array > 0.0
         elif name in ("friction", "contact"):
             allowed &= ~(array < 0.0)
         elif name == "inertia" and allowed.all():
-            allowed &= (np.linalg.eigvalsh(array) > 0.0).all(-1)[..., None, None]
+            allowed &= np.asarray(np.linalg.eigvalsh(array) > 0.0).all(axis=-1)[..., None, None]
         if not allowed.all():
             where = tuple(int(i) for i in np.argwhere(~allowed)[0])
             raise WarpLcpError(f"set_parameters: {name}{list(where)} is {array[where]}; {PARAMETERS[name]}")
@@ -268,13 +268,10 @@ class Simulator:
         wp.launch(k.contact_rows, dim=e, inputs=rows, device=dev)
         for i, method in enumerate(self._methods):
             method.launch(self)
-            wp.launch(
-                k.certify,
-                dim=e,
-                inputs=[self.bodies, self.tolerance, int(i + 1 == len(self._methods)), self.next_velocity, self.rows]
-                + [self.unsolved, self.residual, self.residual_energy, self.status],
-                device=dev,
-            )
+            final = int(i + 1 == len(self._methods))
+            answer = [self.unsolved, self.residual, self.residual_energy, self.status]
+            inputs = [self.bodies, self.tolerance, final, self.next_velocity, self.rows, *answer]
+            wp.launch(k.certify, dim=e, inputs=inputs, device=dev)
         wp.launch(k.remember, dim=e, inputs=[h, self.rows, self.slots], device=dev)
         wp.launch(k.integrate, dim=body_dim, inputs=[self.topology, self.bodies, self.next_velocity, h, self.q, self.v], device=dev)
         wp.launch(k.kinematics, dim=body_dim, inputs=[self.q, self.v, self.topology, self.bodies], device=dev)
@@ -298,7 +295,9 @@ class Simulator:
     def _allocate(self) -> None:
         t, m, e = self._types, self.model, self.num_envs
         b, c, r = m.num_bodies, m.num_slots, m.max_contacts
-        ints = lambda x: wp.array(np.ascontiguousarray(x, dtype=np.int32), dtype=int, device=self.device)
+
+        def ints(values: np.ndarray) -> wp.array:
+            return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=int, device=self.device)
 
         topology = self.topology = t.Topology()
         topology.joint_type, topology.q_start, topology.v_start = ints(m.joint_type), ints(m.q_start), ints(m.v_start)
@@ -372,11 +371,12 @@ class Simulator:
         self._methods = [method() for method in METHODS[self.method]]
         for method in self._methods:
             method.prepare(self)
-        threads = [*vars(self._kernels).values(), *(kernel for kernel, *_ in self._pair_kernels)]
-        for block_dim in (None, LANES):
-            kernels = [m.kernel for m in self._methods if m.block_dim == block_dim] + (threads if block_dim is None else [])
-            if kernels:
-                wp.force_load(self.device, modules=[k.module for k in kernels], block_dim=block_dim)
+        self.kernels = [*vars(self._kernels).values(), *(k for k, *_ in self._pair_kernels), *(m.kernel for m in self._methods)]
+        by_block: dict[int, list[Any]] = {}
+        for kernel in self.kernels:
+            by_block.setdefault(kernel.module.options["block_dim"], []).append(kernel.module)
+        for block_dim, modules in by_block.items():
+            wp.force_load(self.device, modules=modules, block_dim=block_dim)
 
 
 def _choice(what: str, value: str, choices: tuple[str, ...]) -> None:

@@ -11,7 +11,8 @@ import warp as wp
 
 from .errors import WarpLcpError
 from .kernels import lemke
-from .methods import LANES, lcp_workspace, workspaces
+from .kernels.types import LANES
+from .methods import lcp_workspace, workspaces
 
 
 @dataclass(frozen=True)

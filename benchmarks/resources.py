@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Registers, spills and shared memory of every kernel, compiled for a GPU on any machine.
+
+Compiles each kernel that a Simulator can create, and those of solve_lcp and the logger, for sm_90 without a driver, counts the entry
+points in the binaries and reads their resources with cuobjdump (PyPI: nvidia-cuda-cuobjdump).
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import warp as wp
+from warp_lcp.kernels import lemke, watch
+
+import warp_lcp as wl
+from warp_lcp.methods import METHODS
+from warp_lcp.simulator import PRECISIONS
+
+ARCHITECTURE = 90
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What one kernel takes: registers a thread, bytes of stack and local memory (spills), bytes of shared memory."""
+
+    kernel: str
+    precision: str
+    registers: int
+    stack: int
+    local: int
+    shared: int
+
+
+def every_shape_pair() -> wl.Model:
+    """A scene in which every pair of shapes can meet."""
+    builder = wl.ModelBuilder()
+    builder.add_plane()
+    for name in ("a", "b"):
+        body = builder.add_body(name)
+        builder.add_box(body, (0.1, 0.1, 0.1))
+        builder.add_sphere(builder.add_body(name + " ball"), 0.1)
+    return builder.finalize()
+
+
+def kernels(precision: str) -> dict[str, wp.Kernel]:
+    """Every kernel of one precision by its name."""
+    model, found = every_shape_pair(), [lemke.make(PRECISIONS[precision][0]), watch.collect_status]
+    for method in METHODS:
+        found += wl.Simulator(model, method=method, precision=precision, device="cpu").kernels
+    return {kernel.key.split("__")[-1]: kernel for kernel in found}
+
+
+def cuobjdump() -> str:
+    """The program, from PATH or from PyPI's package."""
+    found = shutil.which("cuobjdump")
+    if found:
+        return found
+    import nvidia
+
+    programs = [p for root in nvidia.__path__ for p in Path(root).glob("*/bin/cuobjdump")]
+    if not programs:
+        raise FileNotFoundError("cuobjdump is missing: python -m pip install nvidia-cuda-cuobjdump")
+    return str(programs[0])
+
+
+def measure(precision: str) -> list[Resources]:
+    """Compile every kernel of one precision and read its resources.
+
+    Raises:
+        RuntimeError: where a binary does not hold exactly the one entry point that was asked for.
+    """
+    table = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, kernel in kernels(precision).items():
+            (binary,) = wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=f"{folder}/{name}", use_ptx=False)
+            text = subprocess.run([cuobjdump(), "--dump-resource-usage", str(binary)], capture_output=True, text=True, check=True).stdout
+            entries = re.findall(r"Function (\S*_cuda_kernel_forward):\s+(.*)", text)
+            if len(entries) != 1:
+                raise RuntimeError(f"{name} ({precision}): {len(entries)} entry points in its binary instead of 1")
+            use = {key: int(value) for key, value in re.findall(r"([A-Z]+):(\d+)", entries[0][1])}
+            table.append(Resources(name, precision, use["REG"], use["STACK"], use["LOCAL"], use["SHARED"]))
+    return table
+
+
+def markdown(table: list[Resources]) -> str:
+    """The table as Markdown."""
+    lines = ["| kernel | precision | registers | stack B | local B | shared B |", "| --- | --- | --- | --- | --- | --- |"]
+    lines += [f"| {r.kernel} | {r.precision} | {r.registers} | {r.stack} | {r.local} | {r.shared} |" for r in table]
+    return "\n".join(lines)

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every kernel compiles for CUDA on a machine without a GPU; a kernel that the compiler leaves out is a failure."""
+
+import importlib
+import pkgutil
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import warp_lcp.kernels
+
+from benchmarks import resources
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_every_kernel_compiles_for_sm_90(precision):
+    table = resources.measure(precision)
+    assert {row.kernel for row in table} == set(resources.kernels(precision))
+    assert all(row.registers > 0 for row in table)
+
+
+def test_the_table_misses_no_kernel():
+    """Every @wp.kernel in the sources is among the compiled ones."""
+    written = set()
+    for info in pkgutil.iter_modules(warp_lcp.kernels.__path__):
+        lines = Path(importlib.import_module(f"warp_lcp.kernels.{info.name}").__file__).read_text().splitlines()
+        for line, below in pairwise(lines):
+            if line.strip().startswith("@wp.kernel"):
+                written.add(below.strip().removeprefix("def ").split("(")[0])
+    assert written == set(resources.kernels("float64"))
