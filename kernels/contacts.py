@@ -229,6 +229,13 @@ def make(real):
         contacts.directions[env, i] = k
         contacts.damping[env, i] = b_t
         contacts.impulse[env, i] = vec3()
+        # What velocity pivoting starts from: closed where it was loaded or is about to be, axes as they were named.
+        state = int(0)
+        if impulse > real(0.0) and contacts.free[env, i][0] < real(0.0):
+            state = 1
+        if slides and sliding != FACETS:
+            state = state | 2
+        contacts.state[env, i] = state
 
     @wp.kernel(module="unique", enable_backward=False)
     def contact_rows(

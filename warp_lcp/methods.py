@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from .kernels import lcp, lemke, pgs
+from .kernels import lcp, lemke, pgs, pivoting
 from .kernels.types import LANES
 
 if TYPE_CHECKING:
@@ -61,6 +61,19 @@ class Lemke:
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
+class VelocityPivoting:
+    """Principal pivoting on contact states in the velocities; contacts with more than two directions are not for it."""
+
+    LIMIT = 12
+
+    def prepare(self, sim: Simulator) -> None:
+        self.kernel = pivoting.make_single(sim.real)
+
+    def launch(self, sim: Simulator) -> None:
+        inputs = [sim.bodies, 0, sim.parameters.mass, sim.rows, self.LIMIT, sim.sign_tolerance, sim.iterations]
+        wp.launch(self.kernel, dim=sim.num_envs, inputs=inputs, device=sim.device)
+
+
 class BlockPGS:
     """Block projected Gauss-Seidel: a fixed number of cold sweeps, fewer where it converges."""
 
@@ -79,5 +92,7 @@ class BlockPGS:
 METHODS: dict[str, tuple[type, ...]] = {
     "auto": (Lemke,),
     "lemke": (Lemke,),
+    "velocity_pivoting": (VelocityPivoting,),
+    "x": (VelocityPivoting, Lemke),
     "pgs": (BlockPGS,),
 }

@@ -135,6 +135,7 @@ class Simulator:
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
         self.tolerance = TOLERANCE
+        self.sign_tolerance = 1e-12 if self.real is wp.float64 else 1e-6
         self._types = scalar_types(self.real)
         self._allocate()
         self._load_kernels()
@@ -216,7 +217,7 @@ class Simulator:
         elif name in ("friction", "contact"):
             allowed &= ~(array < 0.0)
         elif name == "inertia" and allowed.all():
-            allowed &= np.asarray(np.linalg.eigvalsh(array) > 0.0).all(axis=-1)[..., None, None]
+            allowed &= np.linalg.eigvalsh(array).min(axis=-1)[..., None, None] > 0.0
         if not allowed.all():
             where = tuple(int(i) for i in np.argwhere(~allowed)[0])
             raise WarpLcpError(f"set_parameters: {name}{list(where)} is {array[where]}; {PARAMETERS[name]}")

@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Principal pivoting in velocities: the LCP of eq. 39 without ever forming it.
+
+Every contact is open or closed, and each friction axis of a closed one sticks or slides at its limit. For given states
+all rows are equations, and eliminating the impulses leaves a system of the size of the velocities: with x = v+ - v_free
+and f = J v_free + d,
+
+    closed  p_n = -(f_n + J_n x) / eps_n        stick  p_j = -(f_j + J_j x) / eps_j        slide  p_j = s mu_j p_n
+
+    (M + sum (J_n + s mu J_j)^T J_n / eps_n + sum J_j^T J_j / eps_j) x = -sum (J_n + s mu J_j)^T f_n / eps_n - sum J_j^T f_j / eps_j.
+
+States whose sign conditions fail are flipped, all at once, until none does. Started from the states that the contact
+rows expect (loaded or not, sliding or sticking) that takes one to three solves. It may cycle: then the environment
+stays unsolved and a safer method takes over.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .types import scalar_types
+
+# State of a contact while it is solved: bit 0 closed, bits 1-2 axis t1, bits 3-4 axis t2.
+CLOSED = wp.constant(1)
+AXIS_STICKS = 0
+AXIS_SLIDES_UP = 1  # along +t: the impulse is -mu p_n
+AXIS_SLIDES_DOWN = 2
+
+
+@functools.cache
+def functions(real) -> SimpleNamespace:
+    """Contact-level functions, whatever solves the linear system."""
+    t = scalar_types(real)
+    vec3 = t.vec3
+    Contacts = t.Contacts
+
+    @wp.func
+    def axis_state(state: int, axis: int) -> int:
+        return (state >> (1 + 2 * axis)) & 3
+
+    @wp.func
+    def axis_impulse(relaxed: real, eps: real, mu: real, p_n: real, state: int) -> real:
+        """Impulse of a friction axis in the given state; relaxed = f_j + J_j x."""
+        p = -relaxed / eps
+        if state == AXIS_SLIDES_UP:
+            p = -mu * p_n
+        elif state == AXIS_SLIDES_DOWN:
+            p = mu * p_n
+        return p
+
+    @wp.func
+    def next_axis_state(relaxed: real, eps: real, mu: real, p_n: real, state: int, tolerance: real) -> int:
+        """State that the sign conditions ask for; `tolerance` [m/s] keeps round-off from flipping it."""
+        result = state
+        if state == AXIS_STICKS:
+            p = -relaxed / eps
+            if p > mu * p_n + tolerance / eps * real(1.0e-6):
+                result = AXIS_SLIDES_DOWN
+            elif p < -mu * p_n - tolerance / eps * real(1.0e-6):
+                result = AXIS_SLIDES_UP
+        elif state == AXIS_SLIDES_UP:
+            if relaxed - eps * mu * p_n < -tolerance:
+                result = AXIS_STICKS
+        else:
+            if relaxed + eps * mu * p_n > tolerance:
+                result = AXIS_STICKS
+        return result
+
+    @wp.func
+    def next_state(contacts: Contacts, env: int, i: int, relaxed: vec3, state: int, tolerance: real) -> int:
+        """State of contact i for f + J x = relaxed."""
+        eps = contacts.relaxation[env, i]
+        p_n = -relaxed[0] / eps[0]
+        closed = state & CLOSED
+        if closed != 0:
+            if p_n * (contacts.inv_mass[env, i][0] + eps[0]) < -tolerance:
+                closed = 0
+        elif relaxed[0] < -tolerance:
+            closed = CLOSED
+        result = closed | (state & 30)
+        if (state & CLOSED) != 0 and closed != 0 and contacts.directions[env, i] > 0:
+            mu = contacts.mu[env, i]
+            p_n = wp.max(p_n, real(0.0))
+            first = next_axis_state(relaxed[1], eps[1], mu[0], p_n, axis_state(state, 0), tolerance)
+            second = next_axis_state(relaxed[2], eps[2], mu[1], p_n, axis_state(state, 1), tolerance)
+            result = CLOSED | (first << 1) | (second << 3)
+        return result
+
+    @wp.func
+    def state_impulse(contacts: Contacts, env: int, i: int, relaxed: vec3, state: int) -> vec3:
+        """Impulse of contact i for f + J x = relaxed."""
+        p = vec3()
+        if (state & CLOSED) != 0:
+            eps = contacts.relaxation[env, i]
+            mu = contacts.mu[env, i]
+            p[0] = wp.max(-relaxed[0] / eps[0], real(0.0))
+            if contacts.directions[env, i] > 0:
+                p[1] = axis_impulse(relaxed[1], eps[1], mu[0], p[0], axis_state(state, 0))
+                p[2] = axis_impulse(relaxed[2], eps[2], mu[1], p[0], axis_state(state, 1))
+        return p
+
+    return SimpleNamespace(axis_state=axis_state, next_state=next_state, state_impulse=state_impulse)
+
+
+@functools.cache
+def make_single(real):
+    """Kernel ``pivot_single`` for scenes with one movable body: a thread an environment, 6 x 6 in registers; dim (E)."""
+    t = scalar_types(real)
+    vec3, mat33 = t.vec3, t.mat33
+    vec6 = wp.types.vector(length=6, dtype=real)
+    mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
+    Bodies, Contacts = t.Bodies, t.Contacts
+    f = functions(real)
+    axis_state, next_state, state_impulse = f.axis_state, f.next_state, f.state_impulse
+
+    @wp.func
+    def row(direction: vec3, arm: vec3, sign: real) -> vec6:
+        """J of one direction of a contact: sign (d, r x d)."""
+        m = wp.cross(arm, direction)
+        return vec6(
+            sign * direction[0], sign * direction[1], sign * direction[2], sign * m[0], sign * m[1], sign * m[2]
+        )
+
+    @wp.func
+    def solve(a: mat66, b: vec6) -> vec6:
+        """Gaussian elimination; the certificate judges the answer, so no pivot search."""
+        for k in range(6):
+            p = real(1.0) / a[k, k]
+            for i in range(k + 1, 6):
+                g = a[i, k] * p
+                b[i] = b[i] - g * b[k]
+                for j in range(k + 1, 6):
+                    a[i, j] = a[i, j] - g * a[k, j]
+        for kk in range(6):
+            k = 5 - kk
+            x = b[k]
+            for j in range(k + 1, 6):
+                x -= a[k, j] * b[j]
+            b[k] = x / a[k, k]
+        return b
+
+    @wp.func
+    def add_contact(a: mat66, b: vec6, contacts: Contacts, env: int, i: int, com: vec3, sign: real):
+        """Add what a closed contact contributes in its present state."""
+        frame = contacts.frame[env, i]
+        eps = contacts.relaxation[env, i]
+        free = contacts.free[env, i]
+        state = contacts.state[env, i]
+        arm = contacts.point[env, i] - com
+        j_n = row(frame[0], arm, sign)
+        column = j_n
+        if contacts.directions[env, i] > 0:
+            for axis in range(2):
+                j_t = row(frame[axis + 1], arm, sign)
+                s = axis_state(state, axis)
+                if s == AXIS_STICKS:
+                    scaled = j_t / eps[axis + 1]
+                    a += wp.outer(scaled, j_t)
+                    b -= scaled * free[axis + 1]
+                elif s == AXIS_SLIDES_UP:
+                    column -= contacts.mu[env, i][axis] * j_t
+                else:
+                    column += contacts.mu[env, i][axis] * j_t
+        column = column / eps[0]
+        a += wp.outer(column, j_n)
+        b -= column * free[0]
+        return a, b
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def pivot_single(
+        bodies: Bodies,
+        body: int,
+        mass: wp.array2d(dtype=real),
+        contacts: Contacts,
+        limit: int,
+        tolerance: real,
+        iterations: wp.array(dtype=int),
+    ):
+        env = wp.tid()
+        r = contacts.count[env]
+        if r == 0:
+            return
+        com = bodies.com[env, body]
+        inertia = wp.inverse(bodies.inv_inertia[env, body])
+        m = real(1.0) / bodies.inv_mass[env, body]
+        x = vec6()
+        flips = int(1)
+        solves = int(0)
+        for i in range(r):
+            if contacts.directions[env, i] > 2:
+                flips = 0
+        while flips > 0 and solves < limit:
+            a = mat66(
+                m, real(0.0), real(0.0), real(0.0), real(0.0), real(0.0),
+                real(0.0), m, real(0.0), real(0.0), real(0.0), real(0.0),
+                real(0.0), real(0.0), m, real(0.0), real(0.0), real(0.0),
+                real(0.0), real(0.0), real(0.0), inertia[0, 0], inertia[0, 1], inertia[0, 2],
+                real(0.0), real(0.0), real(0.0), inertia[1, 0], inertia[1, 1], inertia[1, 2],
+                real(0.0), real(0.0), real(0.0), inertia[2, 0], inertia[2, 1], inertia[2, 2],
+            )  # fmt: skip
+            b = vec6()
+            for i in range(r):
+                if (contacts.state[env, i] & CLOSED) != 0:
+                    sign = real(1.0)
+                    if contacts.body[env, i][0] == body:
+                        sign = real(-1.0)
+                    a, b = add_contact(a, b, contacts, env, i, com, sign)
+            x = solve(a, b)
+            solves += 1
+            flips = int(0)
+            dv = vec3(x[0], x[1], x[2])
+            dw = vec3(x[3], x[4], x[5])
+            for i in range(r):
+                du = dv + wp.cross(dw, contacts.point[env, i] - com)
+                if contacts.body[env, i][0] == body:
+                    du = -du
+                relaxed = contacts.free[env, i] + contacts.frame[env, i] * du
+                state = contacts.state[env, i]
+                after = next_state(contacts, env, i, relaxed, state, tolerance)
+                if after != state:
+                    flips += 1
+                    contacts.state[env, i] = after
+                else:
+                    contacts.impulse[env, i] = state_impulse(contacts, env, i, relaxed, state)
+        iterations[env] = iterations[env] + solves
+
+    return pivot_single
