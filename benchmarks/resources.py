@@ -36,22 +36,24 @@ class Resources:
     shared: int
 
 
-def every_shape_pair() -> wl.Model:
-    """A scene in which every pair of shapes can meet."""
-    builder = wl.ModelBuilder()
-    builder.add_plane()
-    for name in ("a", "b"):
-        body = builder.add_body(name)
-        builder.add_box(body, (0.1, 0.1, 0.1))
-        builder.add_sphere(builder.add_body(name + " ball"), 0.1)
-    return builder.finalize()
+def scenes() -> list[wl.Model]:
+    """A scene with one movable body, and one in which every pair of shapes can meet."""
+    single, many = wl.ModelBuilder(), wl.ModelBuilder()
+    single.add_plane()
+    single.add_box(single.add_body(), (0.1, 0.1, 0.1))
+    many.add_plane()
+    for _ in range(2):
+        many.add_box(many.add_body(), (0.1, 0.1, 0.1))
+        many.add_sphere(many.add_body(), 0.1)
+    return [single.finalize(), many.finalize()]
 
 
 def kernels(precision: str) -> dict[str, wp.Kernel]:
     """Every kernel of one precision by its name."""
-    model, found = every_shape_pair(), [lemke.make(PRECISIONS[precision][0]), watch.collect_status]
-    for method in METHODS:
-        found += wl.Simulator(model, method=method, precision=precision, device="cpu").kernels
+    found = [lemke.make(PRECISIONS[precision][0]), watch.collect_status]
+    for model in scenes():
+        for method in METHODS:
+            found += wl.Simulator(model, method=method, precision=precision, device="cpu").kernels
     return {kernel.key.split("__")[-1]: kernel for kernel in found}
 
 

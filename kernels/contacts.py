@@ -30,7 +30,7 @@ TABLE_1 = wp.constant(wp.types.vector(length=5, dtype=wp.float64)(1.0e10, 1.0e8,
 def row_functions(real) -> SimpleNamespace:
     """What a contact row is made of; shared with the stages that apply impulses."""
     t = scalar_types(real)
-    vec3, mat33 = t.vec3, t.mat33
+    vec3 = t.vec3
     Bodies, Parameters = t.Bodies, t.Parameters
     vec5 = wp.types.vector(length=5, dtype=real)
 
@@ -44,13 +44,13 @@ def row_functions(real) -> SimpleNamespace:
         return u
 
     @wp.func
-    def side_mobility(bodies: Bodies, env: int, body: int, point: vec3) -> mat33:
-        """M^-1 seen at a point: 1/m E - [r] I^-1 [r], world axes; zero for the world."""
-        k = mat33()
-        if body >= 0:
-            r = wp.skew(point - bodies.com[env, body])
-            k = wp.diag(vec3(bodies.inv_mass[env, body])) - r * bodies.inv_inertia[env, body] * r
-        return k
+    def mobility(bodies: Bodies, env: int, body: int, point: vec3, d: vec3) -> real:
+        """J M^-1 J^T of one direction at a point of a body: 1/m + (r x d) . I^-1 (r x d); zero for the world."""
+        w = real(0.0)
+        if body >= 0 and bodies.inv_mass[env, body] > real(0.0):
+            m = wp.cross(point - bodies.com[env, body], d)
+            w = bodies.inv_mass[env, body] + wp.dot(m, bodies.inv_inertia[env, body] * m)
+        return w
 
     @wp.func
     def contact_parameters(parameters: Parameters, bodies: Bodies, env: int, shape_a: int, shape_b: int, body_a: int, body_b: int) -> vec5:
@@ -93,7 +93,7 @@ def row_functions(real) -> SimpleNamespace:
 
     return SimpleNamespace(
         point_velocity=point_velocity,
-        side_mobility=side_mobility,
+        mobility=mobility,
         contact_parameters=contact_parameters,
         tangent_part=tangent_part,
         any_tangent=any_tangent,
@@ -107,7 +107,7 @@ def make(real):
     vec2, vec3 = t.vec2, t.vec3
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     f = row_functions(real)
-    point_velocity, side_mobility, contact_parameters = f.point_velocity, f.side_mobility, f.contact_parameters
+    point_velocity, mobility, contact_parameters = f.point_velocity, f.mobility, f.contact_parameters
     tangent_part, any_tangent = f.tangent_part, f.any_tangent
     shape_pose = pair_functions(real).shape_pose
 
@@ -152,8 +152,7 @@ def make(real):
             parameters.friction[env % parameters.friction.shape[0], shape_a]
             + parameters.friction[env % parameters.friction.shape[0], shape_b]
         )
-        mobility = side_mobility(bodies, env, body_a, point) + side_mobility(bodies, env, body_b, point)
-        w_nn = wp.dot(n, mobility * n)
+        w_nn = mobility(bodies, env, body_a, point, n) + mobility(bodies, env, body_b, point, n)
         gravity = parameters.gravity[env % parameters.gravity.shape[0]]
 
         # History: last normal impulse and bristle force; a new contact starts with its weight and slack bristles.
@@ -220,7 +219,9 @@ def make(real):
         contacts.gap[env, i] = phi
         contacts.closed[env, i] = int(closed)
         contacts.frame[env, i] = frame
-        contacts.inv_mass[env, i] = vec3(w_nn, wp.dot(t1, mobility * t1), wp.dot(t2, mobility * t2))
+        w_11 = mobility(bodies, env, body_a, point, t1) + mobility(bodies, env, body_b, point, t1)
+        w_22 = mobility(bodies, env, body_a, point, t2) + mobility(bodies, env, body_b, point, t2)
+        contacts.inv_mass[env, i] = vec3(w_nn, w_11, w_22)
         contacts.relaxation[env, i] = eps
         d = vec3(d_n, wp.dot(t1, d_t), wp.dot(t2, d_t))
         contacts.shift[env, i] = d

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import lemke as lemke_file
+from . import linear
 from .types import LANES, scalar_types, sync
 
 
@@ -25,6 +26,7 @@ def functions(real) -> SimpleNamespace:
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     Bodies, Contacts = t.Bodies, t.Contacts
     LcpWorkspace = lemke_file.functions(real).LcpWorkspace
+    invert = linear.functions(real).invert
 
     @wp.struct
     class ContactWorkspace:
@@ -64,30 +66,6 @@ def functions(real) -> SimpleNamespace:
         if k == 2:
             e = vec2(real(1 - m), real(m))
         return e
-
-    @wp.func
-    def invert(a: wp.array3d(dtype=real), slot: int, n: int, lane: int):
-        """Inverse of a symmetric positive definite matrix in place, by sweeping every pivot (Gauss-Jordan)."""
-        for k in range(n):
-            p = real(1.0) / a[slot, k, k]
-            sync()
-            for j in range(lane, n, wp.block_dim()):
-                if j != k:
-                    a[slot, k, j] = p * a[slot, k, j]
-            sync()
-            for i in range(n):
-                if i != k:
-                    f = a[slot, i, k]
-                    for j in range(lane, n, wp.block_dim()):
-                        if j != k:
-                            a[slot, i, j] -= f * a[slot, k, j]
-            sync()
-            for i in range(lane, n, wp.block_dim()):
-                if i != k:
-                    a[slot, i, k] = -p * a[slot, i, k]
-            if lane == 0:
-                a[slot, k, k] = p
-            sync()
 
     @wp.func
     def number_unknowns(ws: ContactWorkspace, contacts: Contacts, env: int, slot: int, r: int, lane: int):

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from . import linear
 from .types import ITERATION_LIMIT, LANES, RAY, UNCERTIFIED, sync
 
 
@@ -23,6 +24,7 @@ def functions(real) -> SimpleNamespace:
     double = real is wp.float64
     pivot_tolerance = real(1.0e-11) if double else real(1.0e-5)
     harris_slack = real(1.0e-12) if double else real(1.0e-6)
+    solve = linear.functions(real).solve
 
     @wp.struct
     class LcpWorkspace:
@@ -167,37 +169,14 @@ def functions(real) -> SimpleNamespace:
             if lane == 0:
                 ws.tableau[slot, i, m] = -ws.scale[slot, a] * ws.q[slot, a]
         sync()
-        for k in range(m):
-            r = int(k)
-            for i in range(k + 1, m):
-                if wp.abs(ws.tableau[slot, i, k]) > wp.abs(ws.tableau[slot, r, k]):
-                    r = i
-            p = ws.tableau[slot, r, k]
-            if p == real(0.0):
-                return False
-            sync()
-            for j in range(k + lane, m + 1, wp.block_dim()):
-                x = ws.tableau[slot, r, j]
-                ws.tableau[slot, r, j] = ws.tableau[slot, k, j]
-                ws.tableau[slot, k, j] = x / p
-            sync()
-            for i in range(k + 1, m):
-                f = ws.tableau[slot, i, k]
-                if f != real(0.0):
-                    for j in range(k + 1 + lane, m + 1, wp.block_dim()):
-                        ws.tableau[slot, i, j] -= f * ws.tableau[slot, k, j]
-            sync()
-        if lane == 0:
-            for i in range(n):
-                ws.z[slot, i] = real(0.0)
-            for kk in range(m):
-                k = m - 1 - kk
-                x = ws.tableau[slot, k, m]
-                for j in range(k + 1, m):
-                    x -= ws.tableau[slot, k, j] * ws.tableau[slot, j, m]
-                ws.tableau[slot, k, m] = x
-                a = ws.nonbasic[slot, k]
-                ws.z[slot, a] = wp.max(x, real(0.0)) * ws.scale[slot, a]
+        if not solve(ws.tableau, slot, m, lane):
+            return False
+        for i in range(lane, n, wp.block_dim()):
+            ws.z[slot, i] = real(0.0)
+        sync()
+        for i in range(lane, m, wp.block_dim()):
+            a = ws.nonbasic[slot, i]
+            ws.z[slot, a] = wp.max(ws.tableau[slot, i, m], real(0.0)) * ws.scale[slot, a]
         sync()
         return True
 

@@ -19,7 +19,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .types import scalar_types
+from . import linear
+from .types import LANES, scalar_types, sync
 
 # State of a contact while it is solved: bit 0 closed, bits 1-2 axis t1, bits 3-4 axis t2.
 CLOSED = wp.constant(1)
@@ -33,6 +34,7 @@ def functions(real) -> SimpleNamespace:
     """Contact-level functions, whatever solves the linear system."""
     t = scalar_types(real)
     vec3 = t.vec3
+    vec6 = wp.types.vector(length=6, dtype=real)
     Contacts = t.Contacts
 
     @wp.func
@@ -100,27 +102,25 @@ def functions(real) -> SimpleNamespace:
                 p[2] = axis_impulse(relaxed[2], eps[2], mu[1], p[0], axis_state(state, 1))
         return p
 
-    return SimpleNamespace(axis_state=axis_state, next_state=next_state, state_impulse=state_impulse)
+    @wp.func
+    def row(direction: vec3, arm: vec3, sign: real) -> vec6:
+        """J of one direction of a contact and one of its bodies: sign (d, r x d)."""
+        m = wp.cross(arm, direction)
+        return vec6(sign * direction[0], sign * direction[1], sign * direction[2], sign * m[0], sign * m[1], sign * m[2])
+
+    return SimpleNamespace(axis_state=axis_state, next_state=next_state, state_impulse=state_impulse, row=row)
 
 
 @functools.cache
 def make_single(real):
     """Kernel ``pivot_single`` for scenes with one movable body: a thread an environment, 6 x 6 in registers; dim (E)."""
     t = scalar_types(real)
-    vec3, mat33 = t.vec3, t.mat33
+    vec3 = t.vec3
     vec6 = wp.types.vector(length=6, dtype=real)
     mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
     Bodies, Contacts = t.Bodies, t.Contacts
     f = functions(real)
-    axis_state, next_state, state_impulse = f.axis_state, f.next_state, f.state_impulse
-
-    @wp.func
-    def row(direction: vec3, arm: vec3, sign: real) -> vec6:
-        """J of one direction of a contact: sign (d, r x d)."""
-        m = wp.cross(arm, direction)
-        return vec6(
-            sign * direction[0], sign * direction[1], sign * direction[2], sign * m[0], sign * m[1], sign * m[2]
-        )
+    axis_state, next_state, state_impulse, row = f.axis_state, f.next_state, f.state_impulse, f.row
 
     @wp.func
     def solve(a: mat66, b: vec6) -> vec6:
@@ -171,7 +171,6 @@ def make_single(real):
     def pivot_single(
         bodies: Bodies,
         body: int,
-        mass: wp.array2d(dtype=real),
         contacts: Contacts,
         limit: int,
         tolerance: real,
@@ -226,3 +225,164 @@ def make_single(real):
         iterations[env] = iterations[env] + solves
 
     return pivot_single
+
+
+@functools.cache
+def make(real) -> SimpleNamespace:
+    """Bundle ``Workspace`` and kernel ``pivot`` for scenes with several movable bodies; launch tiled with dim (P)."""
+    t = scalar_types(real)
+    vec3 = t.vec3
+    vec6 = wp.types.vector(length=6, dtype=real)
+    Bodies, Contacts = t.Bodies, t.Contacts
+    f = functions(real)
+    axis_state, next_state, state_impulse, row = f.axis_state, f.next_state, f.state_impulse, f.row
+    solve = linear.functions(real).solve
+
+    @wp.struct
+    class Workspace:
+        system: wp.array3d(dtype=real)  # [P, nv, nv + 1]
+        start: wp.array(dtype=int)  # [B] first of a body's six unknowns, -1 = does not answer to forces
+        flips: wp.array(dtype=int)  # [P]
+
+    @wp.func
+    def start_of(ws: Workspace, body: int) -> int:
+        start = int(-1)
+        if body >= 0:
+            start = ws.start[body]
+        return start
+
+    @wp.func
+    def load_masses(ws: Workspace, bodies: Bodies, env: int, slot: int, lane: int):
+        n = ws.system.shape[1]
+        for k in range(lane, n * (n + 1), wp.block_dim()):
+            ws.system[slot, k // (n + 1), k % (n + 1)] = real(0.0)
+        sync()
+        for b in range(lane, ws.start.shape[0], wp.block_dim()):
+            i = ws.start[b]
+            if i >= 0:
+                inertia = wp.inverse(bodies.inv_inertia[env, b])
+                for x in range(3):
+                    ws.system[slot, i + x, i + x] = real(1.0) / bodies.inv_mass[env, b]
+                    for y in range(3):
+                        ws.system[slot, i + 3 + x, i + 3 + y] = inertia[x, y]
+        sync()
+
+    @wp.func
+    def add_term(ws: Workspace, slot: int, start: wp.vec2i, column_a: vec6, column_b: vec6, row_a: vec6, row_b: vec6, f: real, lane: int):
+        """System += [column] [row], right-hand side -= [column] f; the two sides of a contact one below the other."""
+        n = ws.system.shape[1]
+        for k in range(lane, 12, wp.block_dim()):
+            i = start[0]
+            c = column_a[k % 6]
+            if k >= 6:
+                i = start[1]
+                c = column_b[k % 6]
+            if i >= 0:
+                for j in range(6):
+                    if start[0] >= 0:
+                        ws.system[slot, i + k % 6, start[0] + j] += c * row_a[j]
+                    if start[1] >= 0:
+                        ws.system[slot, i + k % 6, start[1] + j] += c * row_b[j]
+                ws.system[slot, i + k % 6, n] -= c * f
+        sync()
+
+    @wp.func
+    def add_contact(ws: Workspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, i: int, lane: int):
+        """Add what a closed contact contributes in its present state."""
+        body = contacts.body[env, i]
+        start = wp.vec2i(start_of(ws, body[0]), start_of(ws, body[1]))
+        arm_a = vec3()
+        arm_b = vec3()
+        if start[0] >= 0:
+            arm_a = contacts.point[env, i] - bodies.com[env, body[0]]
+        if start[1] >= 0:
+            arm_b = contacts.point[env, i] - bodies.com[env, body[1]]
+        frame = contacts.frame[env, i]
+        eps = contacts.relaxation[env, i]
+        free = contacts.free[env, i]
+        state = contacts.state[env, i]
+        n_a = row(frame[0], arm_a, real(-1.0))
+        n_b = row(frame[0], arm_b, real(1.0))
+        column_a = n_a
+        column_b = n_b
+        if contacts.directions[env, i] > 0:
+            for axis in range(2):
+                t_a = row(frame[axis + 1], arm_a, real(-1.0))
+                t_b = row(frame[axis + 1], arm_b, real(1.0))
+                s = axis_state(state, axis)
+                mu = contacts.mu[env, i][axis]
+                if s == AXIS_STICKS:
+                    add_term(ws, slot, start, t_a / eps[axis + 1], t_b / eps[axis + 1], t_a, t_b, free[axis + 1], lane)
+                elif s == AXIS_SLIDES_UP:
+                    column_a -= mu * t_a
+                    column_b -= mu * t_b
+                else:
+                    column_a += mu * t_a
+                    column_b += mu * t_b
+        add_term(ws, slot, start, column_a / eps[0], column_b / eps[0], n_a, n_b, free[0], lane)
+
+    @wp.func
+    def change(ws: Workspace, bodies: Bodies, env: int, slot: int, body: int, point: vec3) -> vec3:
+        """J x of one body at a point."""
+        u = vec3()
+        i = start_of(ws, body)
+        if i >= 0:
+            n = ws.system.shape[1]
+            dv = vec3(ws.system[slot, i, n], ws.system[slot, i + 1, n], ws.system[slot, i + 2, n])
+            dw = vec3(ws.system[slot, i + 3, n], ws.system[slot, i + 4, n], ws.system[slot, i + 5, n])
+            u = dv + wp.cross(dw, point - bodies.com[env, body])
+        return u
+
+    @wp.func
+    def update_states(ws: Workspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, tolerance: real, lane: int) -> int:
+        """Flip the states that fail, keep the impulses of the others; returns the number of flips."""
+        if lane == 0:
+            ws.flips[slot] = 0
+        sync()
+        for i in range(lane, contacts.count[env], wp.block_dim()):
+            body = contacts.body[env, i]
+            point = contacts.point[env, i]
+            du = change(ws, bodies, env, slot, body[1], point) - change(ws, bodies, env, slot, body[0], point)
+            relaxed = contacts.free[env, i] + contacts.frame[env, i] * du
+            state = contacts.state[env, i]
+            after = next_state(contacts, env, i, relaxed, state, tolerance)
+            if after != state:
+                wp.atomic_add(ws.flips, slot, 1)
+                contacts.state[env, i] = after
+            else:
+                contacts.impulse[env, i] = state_impulse(contacts, env, i, relaxed, state)
+        sync()
+        return ws.flips[slot]
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    def pivot(
+        bodies: Bodies,
+        contacts: Contacts,
+        ws: Workspace,
+        limit: int,
+        tolerance: real,
+        iterations: wp.array(dtype=int),
+    ):
+        slot, lane = wp.tid()
+        for env in range(slot, contacts.count.shape[0], ws.system.shape[0]):
+            r = contacts.count[env]
+            flips = r
+            solves = int(0)
+            for i in range(r):
+                if contacts.directions[env, i] > 2:
+                    flips = 0
+            while flips > 0 and solves < limit:
+                load_masses(ws, bodies, env, slot, lane)
+                for i in range(r):
+                    if (contacts.state[env, i] & CLOSED) != 0:
+                        add_contact(ws, bodies, contacts, env, slot, i, lane)
+                flips = 0
+                if solve(ws.system, slot, ws.system.shape[1], lane):
+                    flips = update_states(ws, bodies, contacts, env, slot, tolerance, lane)
+                solves += 1
+                sync()
+            if lane == 0:
+                iterations[env] = iterations[env] + solves
+            sync()
+
+    return SimpleNamespace(Workspace=Workspace, pivot=pivot)

@@ -9,16 +9,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import warp as wp
 
 from .kernels import lcp, lemke, pgs, pivoting
 from .kernels.types import LANES
+from .model import JointType
 
 if TYPE_CHECKING:
     from .simulator import Simulator
 
-#: Blocks that solve LCPs at one time on a GPU: enough to fill the largest, each with its own workspace.
+#: Blocks that work on environments at one time on a GPU, each in its own workspace: enough to fill the largest...
 GPU_WORKSPACES = 2048
+#: ... but no more than this many bytes in all.
+GPU_WORKSPACE_BYTES = 2**28
 
 
 def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
@@ -34,9 +38,9 @@ def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
     return ws
 
 
-def workspaces(num_envs: int, device: wp.Device) -> int:
-    """Problems worked on at one time: one on the CPU, where it stays in the cache."""
-    return 1 if device.is_cpu else min(num_envs, GPU_WORKSPACES)
+def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
+    """Problems of so many scalars worked on at one time: one on the CPU, where it stays in the cache."""
+    return 1 if device.is_cpu else max(1, min(num_envs, GPU_WORKSPACES, GPU_WORKSPACE_BYTES // (8 * scalars)))
 
 
 class Lemke:
@@ -44,9 +48,10 @@ class Lemke:
 
     def prepare(self, sim: Simulator) -> None:
         r, real = sim.model.max_contacts, sim.real
-        slots = workspaces(sim.num_envs, sim.device)
+        n = r * (1 + 2 * sim.directions)
+        slots = workspaces(sim.num_envs, 2 * n * n + 15 * r * r, sim.device)
         self.kernel = lcp.make(real)
-        self.lcp = lcp_workspace(real, slots, r * (1 + 2 * sim.directions), sim.device)
+        self.lcp = lcp_workspace(real, slots, n, sim.device)
         ws = lcp.functions(real).ContactWorkspace()
         ws.W = wp.empty((slots, 3 * r, 3 * r), dtype=real, device=sim.device)
         ws.A_inv = wp.empty((slots, 2 * r, 2 * r), dtype=real, device=sim.device)
@@ -67,11 +72,29 @@ class VelocityPivoting:
     LIMIT = 12
 
     def prepare(self, sim: Simulator) -> None:
-        self.kernel = pivoting.make_single(sim.real)
+        movable = np.flatnonzero(sim.model.joint_type == JointType.FREE)
+        self.single = int(movable[0]) if len(movable) == 1 else None
+        if self.single is not None:
+            self.kernel = pivoting.make_single(sim.real)
+            return
+        made = pivoting.make(sim.real)
+        self.kernel = made.pivot
+        n = sim.model.dofs
+        self.slots = workspaces(sim.num_envs, n * n, sim.device)
+        ws = self.workspace = made.Workspace()
+        ws.system = wp.empty((self.slots, n, n + 1), dtype=sim.real, device=sim.device)
+        start = np.full(sim.model.num_bodies, -1, dtype=np.int32)
+        start[movable] = 6 * np.arange(len(movable))
+        ws.start = wp.array(start, dtype=int, device=sim.device)
+        ws.flips = wp.zeros(self.slots, dtype=int, device=sim.device)
 
     def launch(self, sim: Simulator) -> None:
-        inputs = [sim.bodies, 0, sim.parameters.mass, sim.rows, self.LIMIT, sim.sign_tolerance, sim.iterations]
-        wp.launch(self.kernel, dim=sim.num_envs, inputs=inputs, device=sim.device)
+        tail = [self.LIMIT, sim.sign_tolerance, sim.iterations]
+        if self.single is not None:
+            wp.launch(self.kernel, dim=sim.num_envs, inputs=[sim.bodies, self.single, sim.rows, *tail], device=sim.device)
+        else:
+            inputs = [sim.bodies, sim.rows, self.workspace, *tail]
+            wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
 class BlockPGS:
@@ -90,9 +113,8 @@ class BlockPGS:
 
 #: Methods in the order in which they are tried, by the name that users give.
 METHODS: dict[str, tuple[type, ...]] = {
-    "auto": (Lemke,),
+    "auto": (VelocityPivoting, Lemke),
     "lemke": (Lemke,),
     "velocity_pivoting": (VelocityPivoting,),
-    "x": (VelocityPivoting, Lemke),
     "pgs": (BlockPGS,),
 }

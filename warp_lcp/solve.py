@@ -58,7 +58,7 @@ def solve_lcp(M: Any, q: Any, method: str = "lemke", *, tolerance: float = 1e-8,
         raise WarpLcpError("solve_lcp: M and q must be finite")
     device, real = wp.get_device(device), wp.float64 if kind is np.float64 else wp.float32
     batch, n = q.shape
-    slots = workspaces(batch, device)
+    slots = workspaces(batch, 2 * n * n, device)
     outputs = [wp.empty((batch, n), dtype=real, device=device) for _ in range(2)]
     outputs += [wp.empty(batch, dtype=d, device=device) for d in (real, int, int)]
     inputs = [wp.array(M, dtype=real, device=device), wp.array(q, dtype=real, device=device), 50 * n + 100, tolerance]
