@@ -129,7 +129,8 @@ def make(real) -> SimpleNamespace:
             state = OPEN
             if p[0] > real(0.0):
                 state = STICK
-                inside = project_friction(p_t * real(1.0 + 1.0e-9), p[0], contacts.mu[env, i], k) - p_t * real(1.0 + 1.0e-9)
+                pressed = p_t * (real(1.0) + real(1.0e-6))  # not real(1.0 + ...): literals add up in single precision
+                inside = project_friction(pressed, p[0], contacts.mu[env, i], k) - pressed
                 if k > 0 and wp.dot(inside, inside) > real(0.0):
                     state = SLIDE
             contacts.state[env, i] = state
