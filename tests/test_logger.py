@@ -302,3 +302,28 @@ def test_entity_names_are_unique(tmp_path):
     simulate(path, builder.finalize(), frames=1, num_envs=1)
     entities = {chunk.entity_path for chunk in RrdReader(str(path)).stream()}
     assert len([e for e in entities if e.startswith("/world/bodies/")]) == 2
+
+
+def test_an_environment_that_is_no_number_leaves_the_others_visible(tmp_path):
+    def spoil(sim):
+        q = sim.q.numpy().copy()
+        q[1, 0] = np.nan
+        sim.q.assign(q)
+
+    path = tmp_path / "run.rrd"
+    sim = wl.Simulator(box_model(), 3, 0.01, precision="float32", device="cpu")
+    with wl.RerunLogger(sim, path, every=1) as logger:
+        spoil(sim)
+        sim.step()
+        logger.log()
+    assert np.isfinite(read(path, "/plots/energy", "Scalars:scalars")[-1][1]).all()
+    assert any(text[0].startswith("environment 1: NOT_A_NUMBER") for _, text in read(path, "/log", "TextLog:text"))
+    at = read(path, "/world/bodies/World/Box/Geometry", "InstancePoses3D:translations")[-1][1]
+    assert np.isfinite(at).all(axis=1).tolist() == [True, False, True]
+
+
+def test_a_scene_without_shapes(tmp_path):
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    builder.add_body("point", mass=1.0, inertia=np.eye(3))
+    simulate(tmp_path / "run.rrd", builder.finalize(), frames=2, every=1)
+    assert len(read(tmp_path / "run.rrd", "/plots/energy", "Scalars:scalars")) == 2

@@ -12,7 +12,7 @@ Entities (E logged environments, laid out on a grid; world axes of the scene)::
     plots/iterations         mean and largest number of pivots or sweeps, over all environments
     plots/contacts           mean and largest number of contacts, over all environments
     plots/status             environments whose status had each bit since the last frame, over all environments
-    plots/energy             mechanical energy [J] of the logged environments: mean, least, most
+    plots/energy             mechanical energy [J] of the logged environments: mean, least, most of those that are finite
     log                      the first time an environment is not OK, with its status bits
 
 Timelines: ``step`` (number) and ``sim_time`` (duration). Contact points are those at the start of a step, poses those at
@@ -207,7 +207,9 @@ class RerunLogger:
         pose, velocity = self._read(sim.body_pose), self._read(sim.body_velocity)
         self._log_poses(self._moving, pose)
         energy = self._energy(pose, velocity)
-        self._scalars("plots/energy", energy.mean(), energy.min(), energy.max())
+        energy = energy[np.isfinite(energy)]  # one environment that is no number must not hide the others
+        if len(energy):
+            self._scalars("plots/energy", energy.mean(), energy.min(), energy.max())
 
     def _log_poses(self, shapes: Sequence[int], pose: np.ndarray, static: bool = False) -> None:
         """Poses of shapes, given those of the bodies [n, B, 7]."""
