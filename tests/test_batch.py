@@ -212,6 +212,7 @@ def test_overflow_is_flagged_not_silent():
         ({"formulation": "magic"}, "choose one of phantom_inertia"),
         ({"sliding": "no"}, "choose one of regularized, aligned, facets"),
         ({"integrator": "rk4"}, "choose one of euler"),
+        ({"method": "velocity_pivoting", "precision": "float32"}, "needs precision 'float64'"),
     ],
 )
 def test_arguments_are_checked(arguments, message):

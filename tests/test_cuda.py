@@ -28,3 +28,4 @@ def test_the_table_misses_no_kernel():
             if line.strip().startswith("@wp.kernel"):
                 written.add(below.strip().removeprefix("def ").split("(")[0])
     assert written == set(resources.kernels("float64"))
+    assert written - set(resources.kernels("float32")) == {"pivot", "pivot_single"}  # float64 only

@@ -14,7 +14,7 @@ import warp as wp
 from .errors import SimulationError, WarpLcpError
 from .kernels import bodies, box_box, certify, collide, contacts, reset
 from .kernels.types import scalar_types
-from .methods import METHODS
+from .methods import METHODS, chosen
 from .model import Model, ShapeType
 
 SLIDING = ("regularized", "aligned", "facets")
@@ -78,7 +78,8 @@ class Simulator:
         num_envs: number of environments E.
         dt: step size h [s].
         formulation: contact law, see docs/theory.md.
-        method: how the contact problem is solved: 'auto', 'lemke' or 'pgs'.
+        method: how the contact problem is solved: 'lemke', 'velocity_pivoting', 'pgs', or 'auto': velocity pivoting, then
+            Lemke's method for the environments that it left unsolved (in float32: pgs).
         sliding: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes throughout).
         directions: k, friction directions of a sticking contact, at least 2.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
@@ -369,7 +370,7 @@ class Simulator:
                 self._pair_kernels.append((box_box.make(real), first, number, (self.dt,)))
             else:
                 self._pair_kernels.append((collide.make(real)[kind], first, number, ()))
-        self._methods = [method() for method in METHODS[self.method]]
+        self._methods = [method() for method in chosen(self.method, self.precision)]
         for method in self._methods:
             method.prepare(self)
         self.kernels = [*vars(self._kernels).values(), *(k for k, *_ in self._pair_kernels), *(m.kernel for m in self._methods)]

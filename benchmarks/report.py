@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results with what they were taken on: versions, device, load."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+
+def processor() -> str:
+    """Model name of the processor."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def write(folder: Path, what: str, device: wp.Device, data: dict[str, Any]) -> Path:
+    """Write data with its circumstances to folder/<date>-<what>-<device>.json; returns the path."""
+    stamp = datetime.date.today().isoformat()
+    header = {
+        "what": what,
+        "date": stamp,
+        "device": device.name if device.is_cuda else processor(),
+        "cores": os.cpu_count(),
+        "load": os.getloadavg()[0],
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "warp": wp.config.version,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{stamp}-{what}-{'cuda' if device.is_cuda else 'cpu'}.json"
+    path.write_text(json.dumps(header | data, indent=1) + "\n")
+    return path

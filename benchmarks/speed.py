@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Environment steps per second of the paper's box, and start-up times.
+
+Three states, one movable body: at rest, sliding (the paper's example while it slides) and dropped tumbling, with a random
+state for each environment: it lands within 0.1 s of the 0.25 s that are timed. On the CPU everything runs on one core.
+Each figure is the median of several repetitions from the same start; the spread is (max - min) / median.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from tqdm import tqdm
+
+import warp_lcp as wl
+
+DT = 1e-3
+STATES = ("rest", "slide", "tumble")
+STEPS = {"rest": 50, "slide": 50, "tumble": 250}
+SIZES = (1, 64, 1024, 8192)
+COMBINATIONS = (
+    ("auto", "float64"),
+    ("velocity_pivoting", "float64"),
+    ("lemke", "float64"),
+    ("pgs", "float64"),
+    ("lemke", "float32"),
+    ("pgs", "float32"),
+)
+SECONDS = 2.0  # after this long a combination is not repeated again
+
+
+def box() -> wl.Model:
+    """The paper's box (Table 1)."""
+    builder, rough = wl.ModelBuilder(), wl.Material(1.0, 1.0)
+    builder.add_plane(material=rough)
+    body = builder.add_body(pose=(0, 0, 0.5, 0, 0, 0, 1), velocity=(0, 5, 0), angular_velocity=(0, 0, 2 * np.pi), mass=1.0)
+    builder.add_box(body, (0.5, 0.5, 0.5), material=rough)
+    return builder.finalize()
+
+
+def start(sim: wl.Simulator, state: str) -> None:
+    """Write the start of a state into q0, v0; tumbling boxes differ from one environment to the next."""
+    rng, envs = np.random.default_rng(0), sim.num_envs
+    q, v = np.tile(sim.model.q0, (envs, 1)), np.tile(sim.model.v0, (envs, 1))
+    if state == "rest":
+        v[:] = 0.0
+    elif state == "tumble":
+        turn = rng.normal(size=(envs, 4))
+        q[:, 2], q[:, 3:] = rng.uniform(0.87, 1.1, envs), turn / np.linalg.norm(turn, axis=1)[:, None]
+        v = rng.normal(size=(envs, 6)) * 2.0
+        v[:, 2] = -rng.uniform(1.0, 3.0, envs)
+    sim.q0.assign(q)
+    sim.v0.assign(v)
+
+
+def one(device: wp.Device, state: str, envs: int, method: str, precision: str, repetitions: int) -> dict[str, Any]:
+    """Measure one combination."""
+    sim = wl.Simulator(box(), envs, DT, method=method, precision=precision, device=device)
+    start(sim, state)
+    steps = STEPS[state]
+    runs = max(1, 200 // envs)  # of a few environments, timed together
+    sim.reset()
+    sim.step(2)
+    rates, status, residual = [], np.zeros(envs, dtype=np.int32), 0.0
+    finish = time.perf_counter() + SECONDS
+    while len(rates) < repetitions and (not rates or time.perf_counter() < finish):
+        elapsed = 0.0
+        for _ in range(runs):
+            sim.reset()
+            wp.synchronize_device(device)
+            begin = time.perf_counter()
+            sim.step(steps)
+            wp.synchronize_device(device)
+            elapsed += time.perf_counter() - begin
+        rates.append(runs * envs * steps / elapsed)
+        status |= sim.status.numpy()
+        residual = max(residual, float(sim.residual.numpy().max()))
+    median = statistics.median(rates)
+    return {
+        "state": state,
+        "envs": envs,
+        "method": method,
+        "precision": precision,
+        "env_steps_per_s": median,
+        "spread": (max(rates) - min(rates)) / median,
+        "repetitions": len(rates),
+        "iterations": float(sim.iterations.numpy().mean()) / steps,
+        "marked_envs": int(np.count_nonzero(status)),
+        "last_residual": residual,
+        "steps": steps,
+    }
+
+
+def measure(device: wp.Device, quick: bool) -> list[dict[str, Any]]:
+    """Every state, batch size, method and precision."""
+    cases = [(s, e, m, p) for m, p in COMBINATIONS for s in STATES for e in SIZES]
+    return [one(device, *case, 3 if quick else 15) for case in tqdm(cases, desc="speed", disable=None)]
+
+
+def start_up() -> dict[str, float]:
+    """Seconds of a fresh process: import, first step with a cold kernel cache, first step with a warm one."""
+    code = (
+        "import time; a = time.perf_counter(); import warp_lcp as wl; wl.Simulator; b = time.perf_counter();"
+        "import warp as wp; wp.config.log_level = wp.LOG_WARNING; from benchmarks.speed import box;"
+        "c = time.perf_counter(); sim = wl.Simulator(box(), device='cpu'); sim.step(); sim.q.numpy(); print(b - a, time.perf_counter() - c)"
+    )
+    result = {}
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"WARP_CACHE_PATH": cache}
+        for name in ("cold", "warm"):
+            done = subprocess.run(
+                [sys.executable, "-c", code], env=environment, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True
+            )
+            result["import_s"], result[f"{name}_first_step_s"] = (float(x) for x in done.stdout.split()[-2:])
+    return result
+
+
+def markdown(rows: list[dict[str, Any]], start: dict[str, float]) -> str:
+    """Tables: start-up, and env-steps/s by method and batch size."""
+    lines = [", ".join(f"{key} {value:.2f}" for key, value in start.items()), ""]
+    sizes = sorted({row["envs"] for row in rows})
+    lines += ["| method | precision | state | " + " | ".join(f"{n} envs" for n in sizes) + " | iterations | marked envs |"]
+    lines += ["|" + " --- |" * (5 + len(sizes))]
+    for method, precision in COMBINATIONS:
+        for state in STATES:
+            found = [r for r in rows if (r["method"], r["precision"], r["state"]) == (method, precision, state)]
+            rates = " | ".join(f"{r['env_steps_per_s']:,.0f} ± {50 * r['spread']:.0f} %" for r in sorted(found, key=lambda r: r["envs"]))
+            last = max(found, key=lambda r: r["envs"])
+            lines.append(f"| {method} | {precision} | {state} | {rates} | {last['iterations']:.1f} | {last['marked_envs']} |")
+    return "\n".join(lines)
