@@ -44,7 +44,10 @@ def pair_functions(real) -> SimpleNamespace:
 
 @functools.cache
 def make(real) -> dict:
-    """Kernels by the names of the two shape types; launch with dim (E, pairs of that kind)."""
+    """Kernels by the names of the two shape types; launch with dim (E, pairs of that kind).
+
+    ``first`` is the first pair of the kind; ``h`` is for kinds that look ahead (``box_box``).
+    """
     t = scalar_types(real)
     vec3 = t.vec3
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
@@ -52,7 +55,7 @@ def make(real) -> dict:
     shape_pose, write = f.shape_pose, f.write
 
     @wp.kernel(module="unique", enable_backward=False)
-    def plane_sphere(topology: Topology, bodies: Bodies, first: int, slots: Slots):
+    def plane_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
         env, i = wp.tid()
         pair = first + i
         plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
@@ -64,7 +67,7 @@ def make(real) -> dict:
         write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def plane_box(topology: Topology, bodies: Bodies, first: int, slots: Slots):
+    def plane_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
         env, i = wp.tid()
         pair = first + i
         plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
@@ -86,7 +89,7 @@ def make(real) -> dict:
             write(slots, env, slot + k, vertex - normal * (real(0.5) * gap), normal, gap, k)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def sphere_sphere(topology: Topology, bodies: Bodies, first: int, slots: Slots):
+    def sphere_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
         env, i = wp.tid()
         pair = first + i
         a = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
@@ -102,7 +105,7 @@ def make(real) -> dict:
         write(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, 0)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def sphere_box(topology: Topology, bodies: Bodies, first: int, slots: Slots):
+    def sphere_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
         env, i = wp.tid()
         pair = first + i
         centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))

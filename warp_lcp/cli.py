@@ -125,7 +125,7 @@ def describe(reading: SceneReading) -> dict[str, Any]:
     facts: dict[str, Any] = {"scene": reading.source, "simulable": model is not None, "obstacle": obstacle}
     facts |= {"bodies": [{"name": n, "joint": None, "mass": None, "dofs": None} for n in reading.bodies], "joints": list(reading.joints)}
     facts |= {"dofs": None, "shapes": [{"name": n, "type": None, "body": None} for n in reading.shapes], "pairs": None}
-    facts |= {"contact_slots": None, "max_contacts": None, "largest_lcp": None, "bytes_per_env": None}
+    facts |= {"contact_slots": None, "max_contacts": None, "largest_lcp": None, "bytes_per_env": None, "kernels": None}
     if model is not None:
         facts |= _model_facts(model)
     facts |= {"mass": reading.mass, "gravity": list(reading.gravity), "up_axis": reading.up_axis}
@@ -136,6 +136,7 @@ def describe(reading: SceneReading) -> dict[str, Any]:
 
 def _model_facts(model: Model) -> dict[str, Any]:
     from .model import JointType, ShapeType
+    from .simulator import kernel_names
 
     bodies, shapes = [], []
     for name, joint, mass in zip(model.body_names, model.joint_type, model.mass, strict=True):
@@ -154,6 +155,7 @@ def _model_facts(model: Model) -> dict[str, Any]:
         "max_contacts": model.max_contacts,
         "largest_lcp": model.max_contacts * 5,  # one normal unknown and two for each of k = 2 directions
         "bytes_per_env": bytes_per_env(model),
+        "kernels": kernel_names(model),
     }
 
 
@@ -195,6 +197,7 @@ def _print_info(facts: dict[str, Any]) -> None:
         if facts["bytes_per_env"] is None
         else f"{facts['bytes_per_env']} bytes an environment, without the method's workspace",
     }
+    numbers["kernels"] = "?" if facts["kernels"] is None else ", ".join(facts["kernels"])
     console.print(_table("", ("", ""), numbers.items()))
     bodies = [(b["name"], *(_shown(b[key]) for key in ("joint", "mass", "dofs"))) for b in facts["bodies"]]
     console.print(_table(f"bodies: {len(bodies)}", ("name", "joint", "mass / kg", "dofs"), bodies))

@@ -9,7 +9,7 @@ Entities (E logged environments, laid out on a grid; world axes of the scene)::
     world/contacts/forces    force on the second body of each contact, on the first where that one moves freely and the
                              second does not; coloured by state
     plots/residual           log10 of the worst and the 99th percentile residual [m/s] over ALL environments
-    plots/iterations         mean and largest number of pivots or sweeps, over all environments
+    plots/iterations         mean and largest number of solves, pivots or sweeps a step, over all environments
     plots/contacts           mean and largest number of contacts, over all environments
     plots/status             environments whose status had each bit since the last frame, over all environments
     plots/energy             mechanical energy [J] of the logged environments: mean, least, most of those that are finite
@@ -249,7 +249,8 @@ class RerunLogger:
 
     def _log_solver(self) -> None:
         sim = self.sim
-        residual, iterations, count = sim.residual.numpy(), sim.iterations.numpy(), sim.contacts.count.numpy()
+        residual, count = sim.residual.numpy(), sim.contacts.count.numpy()
+        iterations = sim.iterations.numpy() / max(1, sim.last_count)
         seen = self._seen.numpy().copy()
         self._seen.zero_()
         # A residual of zero has no logarithm; nothing below 1e-17 m/s means anything.

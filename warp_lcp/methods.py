@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Solution methods of the contact problem. A method sees one problem, the rows of every environment, and leaves impulses.
 
-A new method is a class with ``prepare`` (allocate, once) and ``launch`` (record its kernels, no host read-back), entered
-in METHODS.
+A new method is a class with ``kernel`` (chosen for a model), ``prepare`` (allocate, once) and ``launch`` (record, no host
+read-back), entered in METHODS.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import warp as wp
 from .errors import WarpLcpError
 from .kernels import lcp, lemke, pgs, pivoting
 from .kernels.types import LANES
-from .model import JointType
+from .model import JointType, Model
 
 if TYPE_CHECKING:
     from .simulator import Simulator
@@ -47,11 +47,13 @@ def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
 class Lemke:
     """Lemke's method on the assembled LCP of eq. 39, no fallback."""
 
+    def __init__(self, model: Model, real: Any):
+        self.kernel = lcp.make(real)
+
     def prepare(self, sim: Simulator) -> None:
         r, real = sim.model.max_contacts, sim.real
         n = r * (1 + 2 * sim.directions)
         slots = workspaces(sim.num_envs, 2 * n * n + 15 * r * r, sim.device)
-        self.kernel = lcp.make(real)
         self.lcp = lcp_workspace(real, slots, n, sim.device)
         ws = lcp.functions(real).ContactWorkspace()
         ws.W = wp.empty((slots, 3 * r, 3 * r), dtype=real, device=sim.device)
@@ -72,27 +74,28 @@ class VelocityPivoting:
 
     LIMIT = 12
 
+    def __init__(self, model: Model, real: Any):
+        self.movable = np.flatnonzero(model.joint_type == JointType.FREE)
+        self.single = len(self.movable) == 1
+        self.kernel = pivoting.make_single(real) if self.single else pivoting.make(real).pivot
+
     def prepare(self, sim: Simulator) -> None:
-        movable = np.flatnonzero(sim.model.joint_type == JointType.FREE)
-        self.single = int(movable[0]) if len(movable) == 1 else None
-        if self.single is not None:
-            self.kernel = pivoting.make_single(sim.real)
+        if self.single:
             return
-        made = pivoting.make(sim.real)
-        self.kernel = made.pivot
         n = sim.model.dofs
         self.slots = workspaces(sim.num_envs, n * n, sim.device)
-        ws = self.workspace = made.Workspace()
+        ws = self.workspace = pivoting.make(sim.real).Workspace()
         ws.system = wp.empty((self.slots, n, n + 1), dtype=sim.real, device=sim.device)
         start = np.full(sim.model.num_bodies, -1, dtype=np.int32)
-        start[movable] = 6 * np.arange(len(movable))
+        start[self.movable] = 6 * np.arange(len(self.movable))
         ws.start = wp.array(start, dtype=int, device=sim.device)
         ws.flips = wp.zeros(self.slots, dtype=int, device=sim.device)
 
     def launch(self, sim: Simulator) -> None:
         tail = [self.LIMIT, sim.sign_tolerance, sim.iterations]
-        if self.single is not None:
-            wp.launch(self.kernel, dim=sim.num_envs, inputs=[sim.bodies, self.single, sim.rows, *tail], device=sim.device)
+        if self.single:
+            inputs = [sim.bodies, int(self.movable[0]), sim.rows, *tail]
+            wp.launch(self.kernel, dim=sim.num_envs, inputs=inputs, device=sim.device)
         else:
             inputs = [sim.bodies, sim.rows, self.workspace, *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
@@ -103,8 +106,11 @@ class BlockPGS:
 
     SWEEPS = 50
 
+    def __init__(self, model: Model, real: Any):
+        self.kernel = pgs.make(real)
+
     def prepare(self, sim: Simulator) -> None:
-        self.kernel = pgs.make(sim.real)
+        """Nothing to allocate: the velocities are the simulator's."""
 
     def launch(self, sim: Simulator) -> None:
         # Sweeps end where no impulse changes a velocity by more than a hundredth of what certifies an answer.

@@ -95,7 +95,8 @@ class Simulator:
         status: [E] :class:`Status` bits of the last step() call, or-ed over its steps.
         residual: [E] m/s, largest violation of the law that was solved, of the last step.
         residual_energy: [E] J, unit-consistent energy error of the last step.
-        iterations: [E] pivots or sweeps of the last step() call.
+        iterations: [E] solves, pivots or sweeps of the last step() call, summed over its steps.
+        time: simulated seconds. last_count: steps of the last step() call.
 
     Raises:
         WarpLcpError: for an argument outside its range.
@@ -142,6 +143,7 @@ class Simulator:
         self._load_kernels()
         self._graph: Any = None
         self.time = 0.0
+        self.last_count = 0
 
     # ---------------------------------------------------------------------------------------------------- stepping
 
@@ -154,6 +156,7 @@ class Simulator:
         for _ in range(count):
             wp.capture_launch(self._graph)
         self.time += count * self.dt
+        self.last_count = count
         if self.strict:
             self._raise_for_status()
 
@@ -262,8 +265,8 @@ class Simulator:
         body_dim = (e, self.model.num_bodies)
         wp.launch(k.kinematics, dim=body_dim, inputs=[self.q, self.v, self.topology, self.bodies], device=dev)
         wp.launch(k.free_motion, dim=body_dim, inputs=[self.topology, self.parameters, self.wrench, h, self.bodies], device=dev)
-        for kernel, first, number, extra in self._pair_kernels:
-            wp.launch(kernel, dim=(e, number), inputs=[self.topology, self.bodies, first, *extra, self.slots], device=dev)
+        for kernel, first, number in self._pair_kernels:
+            wp.launch(kernel, dim=(e, number), inputs=[self.topology, self.bodies, first, h, self.slots], device=dev)
         self.unsolved.fill_(1)
         sliding = SLIDING.index(self.sliding)
         rows = [self.topology, self.parameters, self.bodies, self.slots, h, sliding, self.directions, self.rows, self.status]
@@ -351,34 +354,45 @@ class Simulator:
         self.residual, self.residual_energy = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(2))
 
     def _load_kernels(self) -> None:
-        real, m = self.real, self.model
-        body, cert = bodies.make(real), certify.make(real)
-        self._kernels = SimpleNamespace(
-            kinematics=body.kinematics,
-            free_motion=body.free_motion,
-            contact_rows=contacts.make(real),
-            certify=cert.certify,
-            remember=cert.remember,
-            integrate=cert.integrate,
-            reset=reset.make(real),
-        )
-        self._pair_kernels: list[tuple[Any, int, int, tuple]] = []
-        kinds = [tuple(ShapeType(m.shape_type[s]).name for s in pair) for pair in m.pairs]
-        for kind in dict.fromkeys(kinds):
-            first, number = kinds.index(kind), kinds.count(kind)
-            if kind == ("BOX", "BOX"):
-                self._pair_kernels.append((box_box.make(real), first, number, (self.dt,)))
-            else:
-                self._pair_kernels.append((collide.make(real)[kind], first, number, ()))
-        self._methods = [method() for method in chosen(self.method, self.precision)]
+        self._kernels, self._pair_kernels = stage_kernels(self.model, self.real)
+        self._methods = [method(self.model, self.real) for method in chosen(self.method, self.precision)]
         for method in self._methods:
             method.prepare(self)
-        self.kernels = [*vars(self._kernels).values(), *(k for k, *_ in self._pair_kernels), *(m.kernel for m in self._methods)]
+        pair_kernels = [kernel for kernel, *_ in self._pair_kernels]
+        self.kernels = [*vars(self._kernels).values(), *pair_kernels, *(m.kernel for m in self._methods)]
         by_block: dict[int, list[Any]] = {}
         for kernel in self.kernels:
             by_block.setdefault(kernel.module.options["block_dim"], []).append(kernel.module)
         for block_dim, modules in by_block.items():
             wp.force_load(self.device, modules=modules, block_dim=block_dim)
+
+
+def stage_kernels(model: Model, real: Any) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
+    """Kernels of the stages by name, and (kernel, first pair, number of pairs) for each kind of pair in the model."""
+    body, answer = bodies.make(real), certify.make(real)
+    stages = SimpleNamespace(
+        kinematics=body.kinematics,
+        free_motion=body.free_motion,
+        contact_rows=contacts.make(real),
+        certify=answer.certify,
+        remember=answer.remember,
+        integrate=answer.integrate,
+        reset=reset.make(real),
+    )
+    kinds = [tuple(ShapeType(model.shape_type[s]).name for s in pair) for pair in model.pairs]
+    pairs = []
+    for kind in dict.fromkeys(kinds):
+        kernel = box_box.make(real) if kind == ("BOX", "BOX") else collide.make(real)[kind]
+        pairs.append((kernel, kinds.index(kind), kinds.count(kind)))
+    return stages, pairs
+
+
+def kernel_names(model: Model, method: str = "auto", precision: str = "float64") -> list[str]:
+    """Names of the kernels that a Simulator of the model compiles."""
+    real = PRECISIONS[precision][0]
+    stages, pairs = stage_kernels(model, real)
+    solvers = [kind(model, real).kernel for kind in chosen(method, precision)]
+    return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *(k for k, *_ in pairs), *solvers)]
 
 
 def _choice(what: str, value: str, choices: tuple[str, ...]) -> None:
