@@ -57,26 +57,21 @@ def law(real) -> SimpleNamespace:
 def make(real) -> SimpleNamespace:
     """Kernels ``certify`` (dim E) and ``integrate`` (dim E, B)."""
     t = scalar_types(real)
-    vec2, vec3, transform, spatial = t.vec2, t.vec3, t.transform, t.spatial
+    vec2, vec3, mat33, transform, spatial = t.vec2, t.vec3, t.mat33, t.transform, t.spatial
     Bodies, Contacts, Slots, Topology = t.Bodies, t.Contacts, t.Slots, t.Topology
     project_friction = law(real).project_friction
 
     @wp.func
-    def push(bodies: Bodies, next_velocity: wp.array2d(dtype=spatial), env: int, body: int, point: vec3, impulse: vec3):
-        """Add M^-1 J^T p of one impulse (world axes) to a body's velocity."""
-        if body >= 0 and bodies.inv_mass[env, body] > real(0.0):
-            dv = bodies.inv_mass[env, body] * impulse
-            dw = bodies.inv_inertia[env, body] * wp.cross(point - bodies.com[env, body], impulse)
-            next_velocity[env, body] = next_velocity[env, body] + spatial(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
+    def push(inv_mass: real, inv_inertia: mat33, arm: vec3, impulse: vec3) -> spatial:
+        """M^-1 J^T p of one impulse (world axes) on one body."""
+        dv = inv_mass * impulse
+        dw = inv_inertia * wp.cross(arm, impulse)
+        return spatial(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
 
     @wp.func
-    def change(bodies: Bodies, next_velocity: wp.array2d(dtype=spatial), env: int, body: int, point: vec3) -> vec3:
-        """Velocity that the impulses gave to a body at a point: J (v+ - v_free)."""
-        u = vec3()
-        if body >= 0:
-            twist = next_velocity[env, body] - bodies.free_velocity[env, body]
-            u = wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), point - bodies.com[env, body])
-        return u
+    def change(twist: spatial, arm: vec3) -> vec3:
+        """J (v+ - v_free) of one body."""
+        return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
 
     @wp.kernel(module="unique", enable_backward=False)
     def certify(
@@ -98,9 +93,12 @@ def make(real) -> SimpleNamespace:
             next_velocity[env, b] = bodies.free_velocity[env, b]
         for i in range(r):
             impulse = wp.transpose(contacts.frame[env, i]) * contacts.impulse[env, i]
-            body = contacts.body[env, i]
-            push(bodies, next_velocity, env, body[0], contacts.point[env, i], -impulse)
-            push(bodies, next_velocity, env, body[1], contacts.point[env, i], impulse)
+            for side in range(2):
+                b = contacts.body[env, i][side]
+                if b >= 0:
+                    arm = contacts.point[env, i] - bodies.com[env, b]
+                    sign = real(2 * side - 1)
+                    next_velocity[env, b] += push(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * impulse)
 
         worst = real(0.0)
         energy = real(0.0)
@@ -111,9 +109,12 @@ def make(real) -> SimpleNamespace:
             p = contacts.impulse[env, i]
             eps = contacts.relaxation[env, i]
             d = contacts.shift[env, i]
-            body = contacts.body[env, i]
-            point = contacts.point[env, i]
-            du = change(bodies, next_velocity, env, body[1], point) - change(bodies, next_velocity, env, body[0], point)
+            du = vec3()
+            for side in range(2):
+                b = contacts.body[env, i][side]
+                if b >= 0:
+                    arm = contacts.point[env, i] - bodies.com[env, b]
+                    du += real(2 * side - 1) * change(next_velocity[env, b] - bodies.free_velocity[env, b], arm)
             relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
             mass = wp.cw_div(vec3(real(1.0)), contacts.inv_mass[env, i] + eps)
             k = contacts.directions[env, i]

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """From contact points to contact rows: frames, stick or slide, relaxation and bristles (eqs. 34, 40-43).
 
-One thread an environment walks over its slots in order, so the rows always come in the same order. The frame of every
+One thread an environment selects its contacts in the order of the slots, so that rows always come in the same order; then
+each contact gets its row. The frame of every
 contact is chosen so that t1 is the direction that matters: the sliding direction while it slides, the direction in
 which it would slip while it sticks. E of eq. 18 is then the same k directions at angles j pi / k for every contact.
+
+Functions take numbers, not bundles of arrays: Warp passes a bundle by value, a kilobyte a call.
 """
 
 import functools
@@ -11,8 +14,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .collide import pair_functions
-from .types import FACETS, OVERFLOW, REGULARIZED, scalar_types
+from .collide import NO_POINT, pair_functions
+from .types import FACETS, FREE, OVERFLOW, REGULARIZED, scalar_types
 
 # Overlaps are pushed apart no faster than this [m/s], whatever the stiffness.
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
@@ -22,62 +25,68 @@ ELASTIC_RANGE = wp.constant(10.0)
 NO_SLIP = wp.constant(1.0e-6)
 # The last normal impulse that eq. 43 divides by is at least this part of the contact's weight.
 IMPULSE_FLOOR = wp.constant(1.0e-2)
-# Table 1 per kilogram of the lighter movable body (warp_lcp.model.TABLE_1), in the order of Parameters.contact.
-TABLE_1 = wp.constant(wp.types.vector(length=5, dtype=wp.float64)(1.0e10, 1.0e8, 1.0e8, 1.0e5, 1.0e-3))
 
 
 @functools.cache
 def row_functions(real) -> SimpleNamespace:
-    """What a contact row is made of; shared with the stages that apply impulses."""
+    """What a contact row is made of."""
     t = scalar_types(real)
-    vec3 = t.vec3
-    Bodies, Parameters = t.Bodies, t.Parameters
+    vec2, vec3, mat33, spatial = t.vec2, t.vec3, t.mat33, t.spatial
     vec5 = wp.types.vector(length=5, dtype=real)
 
-    @wp.func
-    def point_velocity(velocity: wp.array2d(dtype=t.spatial), com: wp.array2d(dtype=vec3), env: int, body: int, point: vec3) -> vec3:
-        """Velocity of the material point of a body at `point`, world axes; zero for the world (-1)."""
-        u = vec3()
-        if body >= 0:
-            twist = velocity[env, body]
-            u = wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), point - com[env, body])
-        return u
+    @wp.struct
+    class History:
+        """The same contact one step ago."""
+
+        touched: bool
+        impulse: real  # h lambda_n, N s
+        bristle: vec3  # lambda_t + b_t u_t, N
+
+    @wp.struct
+    class Row:
+        frame: mat33
+        inv_mass: vec3
+        relaxation: vec3
+        shift: vec3
+        mu: vec2
+        directions: int
+        closed: bool
+        state: int
 
     @wp.func
-    def mobility(bodies: Bodies, env: int, body: int, point: vec3, d: vec3) -> real:
-        """J M^-1 J^T of one direction at a point of a body: 1/m + (r x d) . I^-1 (r x d); zero for the world."""
-        w = real(0.0)
-        if body >= 0 and bodies.inv_mass[env, body] > real(0.0):
-            m = wp.cross(point - bodies.com[env, body], d)
-            w = bodies.inv_mass[env, body] + wp.dot(m, bodies.inv_inertia[env, body] * m)
-        return w
+    def point_velocity(twist: spatial, arm: vec3) -> vec3:
+        """Velocity of the material point of a body at `arm` from its centre of mass, world axes."""
+        return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
 
     @wp.func
-    def contact_parameters(parameters: Parameters, bodies: Bodies, env: int, shape_a: int, shape_b: int, body_a: int, body_b: int) -> vec5:
-        """k_n, b_n, k_t, b_t, v_s of a pair: the mean of what its materials author, else Table 1 for the lighter body."""
-        mass = real(0.0)
-        if body_a >= 0 and bodies.inv_mass[env, body_a] > real(0.0):
-            mass = real(1.0) / bodies.inv_mass[env, body_a]
-        if body_b >= 0 and bodies.inv_mass[env, body_b] > real(0.0):
-            mass_b = real(1.0) / bodies.inv_mass[env, body_b]
-            if mass == real(0.0) or mass_b < mass:
-                mass = mass_b
-        row = env % parameters.contact.shape[0]
-        result = vec5()
-        for k in range(5):
-            a = parameters.contact[row, shape_a, k]
-            b = parameters.contact[row, shape_b, k]
-            if wp.isnan(a) and wp.isnan(b):
-                result[k] = real(TABLE_1[k])
-                if k < 4:
-                    result[k] *= mass
-            elif wp.isnan(a):
-                result[k] = b
-            elif wp.isnan(b):
-                result[k] = a
-            else:
-                result[k] = real(0.5) * (a + b)
+    def side_mobility(inv_mass: real, inv_inertia: mat33, arm: vec3) -> mat33:
+        """M^-1 of one body seen at a point: 1/m E - [r] I^-1 [r], world axes."""
+        r = wp.skew(arm)
+        return wp.diag(vec3(inv_mass)) - r * inv_inertia * r
+
+    @wp.func
+    def authored(a: real, b: real, default: real) -> real:
+        """Mean of what the materials of a pair author (NaN = nothing), else the default."""
+        result = default
+        if wp.isnan(a):
+            if not wp.isnan(b):
+                result = b
+        elif wp.isnan(b):
+            result = a
+        else:
+            result = real(0.5) * (a + b)
         return result
+
+    @wp.func
+    def contact_parameters(a: vec5, b: vec5, mass: real) -> vec5:
+        """k_n, b_n, k_t, b_t, v_s of a pair; unauthored ones are Table 1 for the mass of the lighter movable body."""
+        return vec5(
+            authored(a[0], b[0], real(1.0e10) * mass),
+            authored(a[1], b[1], real(1.0e8) * mass),
+            authored(a[2], b[2], real(1.0e8) * mass),
+            authored(a[3], b[3], real(1.0e5) * mass),
+            authored(a[4], b[4], real(1.0e-3)),
+        )
 
     @wp.func
     def tangent_part(x: vec3, n: vec3) -> vec3:
@@ -91,88 +100,47 @@ def row_functions(real) -> SimpleNamespace:
             axis = vec3(real(0.0), real(1.0), real(0.0))
         return wp.normalize(tangent_part(axis, n))
 
-    return SimpleNamespace(
-        point_velocity=point_velocity,
-        mobility=mobility,
-        contact_parameters=contact_parameters,
-        tangent_part=tangent_part,
-        any_tangent=any_tangent,
-    )
-
-
-@functools.cache
-def make(real):
-    """Kernel ``contact_rows``; launch with dim (E)."""
-    t = scalar_types(real)
-    vec2, vec3 = t.vec2, t.vec3
-    Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
-    f = row_functions(real)
-    point_velocity, mobility, contact_parameters = f.point_velocity, f.mobility, f.contact_parameters
-    tangent_part, any_tangent = f.tangent_part, f.any_tangent
-    shape_pose = pair_functions(real).shape_pose
-
     @wp.func
-    def surface_velocity(topology: Topology, bodies: Bodies, env: int, shape: int) -> vec3:
-        velocity = topology.surface_velocity[shape]
-        if wp.dot(velocity, velocity) > real(0.0):
-            velocity = wp.transform_vector(shape_pose(topology, bodies, env, shape), velocity)
-        return velocity
-
-    @wp.func
-    def write_row(
-        topology: Topology,
-        parameters: Parameters,
-        bodies: Bodies,
-        slots: Slots,
+    def make_row(
+        mobility: mat33,
+        n: vec3,
+        phi: real,
+        u: vec3,
+        u_free: vec3,
+        c: vec5,
+        friction: vec2,
+        history: History,
+        g: real,
         h: real,
         sliding: int,
         directions: int,
-        contacts: Contacts,
-        env: int,
-        slot: int,
-        i: int,
-        u: vec3,
-        u_free: vec3,
-    ):
-        """Row i of an environment from its slot; u and u_free: present and free relative velocity, world axes."""
-        pair = topology.slot_pair[slot]
-        shape_a = topology.pairs[pair, 0]
-        shape_b = topology.pairs[pair, 1]
-        body_a = topology.shape_body[shape_a]
-        body_b = topology.shape_body[shape_b]
-        point = slots.point[env, slot]
-        n = slots.normal[env, slot]
-        phi = slots.gap[env, slot]
-        c = contact_parameters(parameters, bodies, env, shape_a, shape_b, body_a, body_b)
+    ) -> Row:
+        """Row of one contact; u and u_free: present and free velocity of b relative to a, world axes; g = |gravity|.
+
+        mobility: what J M^-1 J^T is for world axes, of both bodies together.
+        """
         k_n = c[0]
         b_n = c[1]
         k_t = c[2]
         b_t = c[3]
-        friction = real(0.5) * (
-            parameters.friction[env % parameters.friction.shape[0], shape_a]
-            + parameters.friction[env % parameters.friction.shape[0], shape_b]
-        )
-        w_nn = mobility(bodies, env, body_a, point, n) + mobility(bodies, env, body_b, point, n)
-        gravity = parameters.gravity[env % parameters.gravity.shape[0]]
+        w_nn = wp.dot(n, mobility * n)
 
-        # History: last normal impulse and bristle force; a new contact starts with its weight and slack bristles.
-        weight = h * wp.length(gravity) / w_nn
+        # A new contact starts with its weight and slack bristles.
+        weight = h * g / w_nn
         if weight == real(0.0):
             weight = wp.abs(wp.dot(n, u_free)) / w_nn
         impulse = weight
         bristle = vec3()
-        touched = slots.last_feature[env, slot] == slots.feature[env, slot]
-        if touched:
-            impulse = slots.last_impulse[env, slot]
-            bristle = slots.last_bristle[env, slot]
-            bristle = tangent_part(bristle, n)
+        if history.touched:
+            impulse = history.impulse
+            bristle = tangent_part(history.bristle, n)
 
         # Normal row. Eqs. 40 and 41 while the surfaces touch; an open gap only may not close by more than itself.
         # Compliance moves surfaces in contact apart and together by the deflection under their load, so one that
         # touched stays in contact within that range: there an unloaded point carries on with the same law as the
         # loaded ones beside it, which is what makes redundant normal forces unique.
         eps_n = real(1.0) / (k_n * h * h + b_n * h)
-        closed = phi <= real(0.0) or (touched and phi * k_n * h <= real(ELASTIC_RANGE) * weight)
+        closed = phi <= real(0.0) or (history.touched and phi * k_n * h <= real(ELASTIC_RANGE) * weight)
         d_n = phi / h
         if closed:
             d_n = wp.max(eps_n * h * k_n * phi, -real(MAX_DEPENETRATION_SPEED))
@@ -211,32 +179,81 @@ def make(real):
             k = 0
         t1 = wp.normalize(tangent_part(t1, n))  # once more: a small slip is a difference of large numbers
         t2 = wp.cross(n, t1)
-        frame = wp.matrix_from_rows(n, t1, t2)
 
-        contacts.slot[env, i] = slot
-        contacts.body[env, i] = wp.vec2i(body_a, body_b)
-        contacts.point[env, i] = point
-        contacts.gap[env, i] = phi
-        contacts.closed[env, i] = int(closed)
-        contacts.frame[env, i] = frame
-        w_11 = mobility(bodies, env, body_a, point, t1) + mobility(bodies, env, body_b, point, t1)
-        w_22 = mobility(bodies, env, body_a, point, t2) + mobility(bodies, env, body_b, point, t2)
-        contacts.inv_mass[env, i] = vec3(w_nn, w_11, w_22)
-        contacts.relaxation[env, i] = eps
-        d = vec3(d_n, wp.dot(t1, d_t), wp.dot(t2, d_t))
-        contacts.shift[env, i] = d
-        contacts.free[env, i] = frame * u_free + d
-        contacts.mu[env, i] = mu_row
-        contacts.directions[env, i] = k
-        contacts.damping[env, i] = b_t
-        contacts.impulse[env, i] = vec3()
-        # What velocity pivoting starts from: closed where it was loaded or is about to be, axes as they were named.
-        state = int(0)
-        if impulse > real(0.0) and contacts.free[env, i][0] < real(0.0):
-            state = 1
+        row = Row()
+        row.frame = wp.matrix_from_rows(n, t1, t2)
+        row.inv_mass = vec3(w_nn, wp.dot(t1, mobility * t1), wp.dot(t2, mobility * t2))
+        row.relaxation = eps
+        row.shift = vec3(d_n, wp.dot(t1, d_t), wp.dot(t2, d_t))
+        row.mu = mu_row
+        row.directions = k
+        row.closed = closed
+        # What velocity pivoting starts from: closed where it was loaded or is about to be, t1 named as it is expected.
+        if impulse > real(0.0) and wp.dot(n, u_free) + d_n < real(0.0):
+            row.state = 1
         if slides and sliding != FACETS:
-            state = state | 2
-        contacts.state[env, i] = state
+            row.state = row.state | 2
+        return row
+
+    return SimpleNamespace(
+        History=History,
+        vec5=vec5,
+        point_velocity=point_velocity,
+        side_mobility=side_mobility,
+        contact_parameters=contact_parameters,
+        make_row=make_row,
+    )
+
+
+@functools.cache
+def make(real) -> SimpleNamespace:
+    """Kernels ``select_contacts`` (dim E) and ``contact_rows`` (dim E, R)."""
+    t = scalar_types(real)
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
+    f = row_functions(real)
+    History, vec5 = f.History, f.vec5
+    point_velocity, side_mobility, contact_parameters, make_row = f.point_velocity, f.side_mobility, f.contact_parameters, f.make_row
+    shape_pose = pair_functions(real).shape_pose
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def select_contacts(
+        topology: Topology, parameters: Parameters, bodies: Bodies, slots: Slots, h: real, contacts: Contacts, status: wp.array(dtype=int)
+    ):
+        """The slots whose gap could close within the step, in order, and the relative velocities there."""
+        env = wp.tid()
+        fall = h * h * wp.length(parameters.gravity[env % parameters.gravity.shape[0]]) + real(1.0e-9)
+        count = int(0)
+        for slot in range(slots.gap.shape[1]):
+            phi = slots.gap[env, slot]
+            if phi < real(NO_POINT):
+                pair = topology.slot_pair[slot]
+                u = vec3()
+                u_free = vec3()
+                for side in range(2):
+                    sign = real(2 * side - 1)
+                    shape = topology.pairs[pair, side]
+                    b = topology.shape_body[shape]
+                    belt = topology.surface_velocity[shape]
+                    if wp.dot(belt, belt) > real(0.0):
+                        belt = sign * wp.transform_vector(shape_pose(topology, bodies, env, shape), belt)
+                        u += belt
+                        u_free += belt
+                    if b >= 0:
+                        arm = slots.point[env, slot] - bodies.com[env, b]
+                        u += sign * point_velocity(bodies.velocity[env, b], arm)
+                        u_free += sign * point_velocity(bodies.free_velocity[env, b], arm)
+                # The speed counts, not just its approaching part: an impact elsewhere on the body turns one into the
+                # other (1.1 mm of overlap at 1 ms without, 3 um with).
+                if phi < h * wp.length(u_free) + fall:
+                    if count < contacts.slot.shape[1]:
+                        contacts.slot[env, count] = slot
+                        contacts.velocity[env, count] = u
+                        contacts.free[env, count] = u_free
+                        count += 1
+                    else:
+                        status[env] = status[env] | OVERFLOW
+        contacts.count[env] = count
 
     @wp.kernel(module="unique", enable_backward=False)
     def contact_rows(
@@ -248,34 +265,57 @@ def make(real):
         sliding: int,
         directions: int,
         contacts: Contacts,
-        status: wp.array(dtype=int),
     ):
-        env = wp.tid()
-        gravity = parameters.gravity[env % parameters.gravity.shape[0]]
-        fall = h * h * wp.length(gravity) + real(1.0e-9)
-        count = int(0)
-        for slot in range(slots.gap.shape[1]):
-            phi = slots.gap[env, slot]
-            if phi < real(1.0e29):
-                pair = topology.slot_pair[slot]
-                shape_a = topology.pairs[pair, 0]
-                shape_b = topology.pairs[pair, 1]
-                body_a = topology.shape_body[shape_a]
-                body_b = topology.shape_body[shape_b]
-                point = slots.point[env, slot]
-                belt = surface_velocity(topology, bodies, env, shape_b) - surface_velocity(topology, bodies, env, shape_a)
-                u_free = point_velocity(bodies.free_velocity, bodies.com, env, body_b, point) + belt
-                u_free -= point_velocity(bodies.free_velocity, bodies.com, env, body_a, point)
-                # A row where the gap could close within the step. The speed counts, not just its approaching part: an
-                # impact elsewhere on the body turns one into the other (1.1 mm of overlap at 1 ms without, 3 um with).
-                if phi < h * wp.length(u_free) + fall:
-                    if count < contacts.slot.shape[1]:
-                        u = point_velocity(bodies.velocity, bodies.com, env, body_b, point) + belt
-                        u -= point_velocity(bodies.velocity, bodies.com, env, body_a, point)
-                        write_row(topology, parameters, bodies, slots, h, sliding, directions, contacts, env, slot, count, u, u_free)
-                        count += 1
-                    else:
-                        status[env] = status[env] | OVERFLOW
-        contacts.count[env] = count
+        """Rows of the selected contacts; velocity and free hold world axes before, the contact frame after."""
+        env, i = wp.tid()
+        if i >= contacts.count[env]:
+            return
+        slot = contacts.slot[env, i]
+        pair = topology.slot_pair[slot]
+        point = slots.point[env, slot]
+        phi = slots.gap[env, slot]
+        g = wp.length(parameters.gravity[env % parameters.gravity.shape[0]])
+        mobility = mat33()
+        mass = real(0.0)  # of the lighter movable body
+        mu = vec2()
+        c_a = vec5()
+        c_b = vec5()
+        body = wp.vec2i()
+        for side in range(2):
+            shape = topology.pairs[pair, side]
+            b = topology.shape_body[shape]
+            body[side] = b
+            mu += real(0.5) * parameters.friction[env % parameters.friction.shape[0], shape]
+            for k in range(5):
+                c_a[k] = c_b[k]
+                c_b[k] = parameters.contact[env % parameters.contact.shape[0], shape, k]
+            if b >= 0 and topology.joint_type[b] == FREE:
+                inv_mass = bodies.inv_mass[env, b]
+                mobility += side_mobility(inv_mass, bodies.inv_inertia[env, b], point - bodies.com[env, b])
+                if mass == real(0.0) or real(1.0) / inv_mass < mass:
+                    mass = real(1.0) / inv_mass
+        c = contact_parameters(c_a, c_b, mass)
+        history = History()
+        history.touched = slots.last_feature[env, slot] == slots.feature[env, slot]
+        history.impulse = slots.last_impulse[env, slot]
+        history.bristle = slots.last_bristle[env, slot]
+        u = contacts.velocity[env, i]
+        u_free = contacts.free[env, i]
+        row = make_row(mobility, slots.normal[env, slot], phi, u, u_free, c, mu, history, g, h, sliding, directions)
 
-    return contact_rows
+        contacts.body[env, i] = body
+        contacts.point[env, i] = point
+        contacts.gap[env, i] = phi
+        contacts.closed[env, i] = int(row.closed)
+        contacts.frame[env, i] = row.frame
+        contacts.inv_mass[env, i] = row.inv_mass
+        contacts.relaxation[env, i] = row.relaxation
+        contacts.shift[env, i] = row.shift
+        contacts.free[env, i] = row.frame * u_free + row.shift
+        contacts.mu[env, i] = row.mu
+        contacts.directions[env, i] = row.directions
+        contacts.damping[env, i] = c[3]
+        contacts.impulse[env, i] = vec3()
+        contacts.state[env, i] = row.state
+
+    return SimpleNamespace(select_contacts=select_contacts, contact_rows=contact_rows)

@@ -31,11 +31,13 @@ AXIS_SLIDES_DOWN = 2
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
-    """Contact-level functions, whatever solves the linear system."""
+    """Functions of one contact, whatever solves the linear system.
+
+    They take numbers, not bundles: Warp passes a bundle by value, a kilobyte a call.
+    """
     t = scalar_types(real)
-    vec3 = t.vec3
+    vec2, vec3 = t.vec2, t.vec3
     vec6 = wp.types.vector(length=6, dtype=real)
-    Contacts = t.Contacts
 
     @wp.func
     def axis_state(state: int, axis: int) -> int:
@@ -70,19 +72,17 @@ def functions(real) -> SimpleNamespace:
         return result
 
     @wp.func
-    def next_state(contacts: Contacts, env: int, i: int, relaxed: vec3, state: int, tolerance: real) -> int:
-        """State of contact i for f + J x = relaxed."""
-        eps = contacts.relaxation[env, i]
+    def next_state(relaxed: vec3, eps: vec3, w_nn: real, mu: vec2, k: int, state: int, tolerance: real) -> int:
+        """State that the sign conditions of a contact ask for; relaxed = f + J x, w_nn of J M^-1 J^T, k directions."""
         p_n = -relaxed[0] / eps[0]
         closed = state & CLOSED
         if closed != 0:
-            if p_n * (contacts.inv_mass[env, i][0] + eps[0]) < -tolerance:
+            if p_n * (w_nn + eps[0]) < -tolerance:
                 closed = 0
         elif relaxed[0] < -tolerance:
             closed = CLOSED
         result = closed | (state & 30)
-        if (state & CLOSED) != 0 and closed != 0 and contacts.directions[env, i] > 0:
-            mu = contacts.mu[env, i]
+        if (state & CLOSED) != 0 and closed != 0 and k > 0:
             p_n = wp.max(p_n, real(0.0))
             first = next_axis_state(relaxed[1], eps[1], mu[0], p_n, axis_state(state, 0), tolerance)
             second = next_axis_state(relaxed[2], eps[2], mu[1], p_n, axis_state(state, 1), tolerance)
@@ -90,14 +90,12 @@ def functions(real) -> SimpleNamespace:
         return result
 
     @wp.func
-    def state_impulse(contacts: Contacts, env: int, i: int, relaxed: vec3, state: int) -> vec3:
-        """Impulse of contact i for f + J x = relaxed."""
+    def state_impulse(relaxed: vec3, eps: vec3, mu: vec2, k: int, state: int) -> vec3:
+        """Impulse of a contact in its state; relaxed = f + J x."""
         p = vec3()
         if (state & CLOSED) != 0:
-            eps = contacts.relaxation[env, i]
-            mu = contacts.mu[env, i]
             p[0] = wp.max(-relaxed[0] / eps[0], real(0.0))
-            if contacts.directions[env, i] > 0:
+            if k > 0:
                 p[1] = axis_impulse(relaxed[1], eps[1], mu[0], p[0], axis_state(state, 0))
                 p[2] = axis_impulse(relaxed[2], eps[2], mu[1], p[0], axis_state(state, 1))
         return p
@@ -115,7 +113,7 @@ def functions(real) -> SimpleNamespace:
 def make_single(real):
     """Kernel ``pivot_single`` for scenes with one movable body: a thread an environment, 6 x 6 in registers; dim (E)."""
     t = scalar_types(real)
-    vec3 = t.vec3
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     vec6 = wp.types.vector(length=6, dtype=real)
     mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
     Bodies, Contacts = t.Bodies, t.Contacts
@@ -141,16 +139,11 @@ def make_single(real):
         return b
 
     @wp.func
-    def add_contact(a: mat66, b: vec6, contacts: Contacts, env: int, i: int, com: vec3, sign: real):
-        """Add what a closed contact contributes in its present state."""
-        frame = contacts.frame[env, i]
-        eps = contacts.relaxation[env, i]
-        free = contacts.free[env, i]
-        state = contacts.state[env, i]
-        arm = contacts.point[env, i] - com
+    def add_contact(a: mat66, b: vec6, frame: mat33, arm: vec3, sign: real, eps: vec3, free: vec3, mu: vec2, k: int, state: int):
+        """Add what a closed contact contributes in its state."""
         j_n = row(frame[0], arm, sign)
         column = j_n
-        if contacts.directions[env, i] > 0:
+        if k > 0:
             for axis in range(2):
                 j_t = row(frame[axis + 1], arm, sign)
                 s = axis_state(state, axis)
@@ -159,9 +152,9 @@ def make_single(real):
                     a += wp.outer(scaled, j_t)
                     b -= scaled * free[axis + 1]
                 elif s == AXIS_SLIDES_UP:
-                    column -= contacts.mu[env, i][axis] * j_t
+                    column -= mu[axis] * j_t
                 else:
-                    column += contacts.mu[env, i][axis] * j_t
+                    column += mu[axis] * j_t
         column = column / eps[0]
         a += wp.outer(column, j_n)
         b -= column * free[0]
@@ -200,11 +193,23 @@ def make_single(real):
             )  # fmt: skip
             b = vec6()
             for i in range(r):
-                if (contacts.state[env, i] & CLOSED) != 0:
+                state = contacts.state[env, i]
+                if (state & CLOSED) != 0:
                     sign = real(1.0)
                     if contacts.body[env, i][0] == body:
                         sign = real(-1.0)
-                    a, b = add_contact(a, b, contacts, env, i, com, sign)
+                    a, b = add_contact(
+                        a,
+                        b,
+                        contacts.frame[env, i],
+                        contacts.point[env, i] - com,
+                        sign,
+                        contacts.relaxation[env, i],
+                        contacts.free[env, i],
+                        contacts.mu[env, i],
+                        contacts.directions[env, i],
+                        state,
+                    )
             x = solve(a, b)
             solves += 1
             flips = int(0)
@@ -215,13 +220,16 @@ def make_single(real):
                 if contacts.body[env, i][0] == body:
                     du = -du
                 relaxed = contacts.free[env, i] + contacts.frame[env, i] * du
+                eps = contacts.relaxation[env, i]
+                mu = contacts.mu[env, i]
+                k = contacts.directions[env, i]
                 state = contacts.state[env, i]
-                after = next_state(contacts, env, i, relaxed, state, tolerance)
+                after = next_state(relaxed, eps, contacts.inv_mass[env, i][0], mu, k, state, tolerance)
                 if after != state:
                     flips += 1
                     contacts.state[env, i] = after
                 else:
-                    contacts.impulse[env, i] = state_impulse(contacts, env, i, relaxed, state)
+                    contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, k, state)
         iterations[env] = iterations[env] + solves
 
     return pivot_single
@@ -344,13 +352,16 @@ def make(real) -> SimpleNamespace:
             point = contacts.point[env, i]
             du = change(ws, bodies, env, slot, body[1], point) - change(ws, bodies, env, slot, body[0], point)
             relaxed = contacts.free[env, i] + contacts.frame[env, i] * du
+            eps = contacts.relaxation[env, i]
+            mu = contacts.mu[env, i]
+            k = contacts.directions[env, i]
             state = contacts.state[env, i]
-            after = next_state(contacts, env, i, relaxed, state, tolerance)
+            after = next_state(relaxed, eps, contacts.inv_mass[env, i][0], mu, k, state, tolerance)
             if after != state:
                 wp.atomic_add(ws.flips, slot, 1)
                 contacts.state[env, i] = after
             else:
-                contacts.impulse[env, i] = state_impulse(contacts, env, i, relaxed, state)
+                contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, k, state)
         sync()
         return ws.flips[slot]
 

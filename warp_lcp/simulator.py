@@ -269,8 +269,10 @@ class Simulator:
             wp.launch(kernel, dim=(e, number), inputs=[self.topology, self.bodies, first, h, self.slots], device=dev)
         self.unsolved.fill_(1)
         sliding = SLIDING.index(self.sliding)
-        rows = [self.topology, self.parameters, self.bodies, self.slots, h, sliding, self.directions, self.rows, self.status]
-        wp.launch(k.contact_rows, dim=e, inputs=rows, device=dev)
+        scene = [self.topology, self.parameters, self.bodies, self.slots, h]
+        wp.launch(k.select_contacts, dim=e, inputs=[*scene, self.rows, self.status], device=dev)
+        inputs = [*scene, sliding, self.directions, self.rows]
+        wp.launch(k.contact_rows, dim=(e, self.model.max_contacts), inputs=inputs, device=dev)
         for i, method in enumerate(self._methods):
             method.launch(self)
             final = int(i + 1 == len(self._methods))
@@ -369,11 +371,12 @@ class Simulator:
 
 def stage_kernels(model: Model, real: Any) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
     """Kernels of the stages by name, and (kernel, first pair, number of pairs) for each kind of pair in the model."""
-    body, answer = bodies.make(real), certify.make(real)
+    body, rows, answer = bodies.make(real), contacts.make(real), certify.make(real)
     stages = SimpleNamespace(
         kinematics=body.kinematics,
         free_motion=body.free_motion,
-        contact_rows=contacts.make(real),
+        select_contacts=rows.select_contacts,
+        contact_rows=rows.contact_rows,
         certify=answer.certify,
         remember=answer.remember,
         integrate=answer.integrate,
