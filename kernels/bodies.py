@@ -46,22 +46,23 @@ def make(real) -> SimpleNamespace:
         return result
 
     @wp.kernel(module="unique", enable_backward=False)
-    def kinematics(q: wp.array2d(dtype=real), v: wp.array2d(dtype=real), topology: Topology, bodies: Bodies):
-        env, b = wp.tid()
-        if topology.joint_type[b] == FIXED:
-            bodies.pose[env, b] = topology.joint_pose[b]
-            bodies.velocity[env, b] = spatial()
-            return
-        i = topology.q_start[b]
-        j = topology.v_start[b]
-        pose = transform()
-        velocity = spatial()
-        for k in range(7):
-            pose[k] = q[env, i + k]
-        for k in range(6):
-            velocity[k] = v[env, j + k]
-        bodies.pose[env, b] = pose
-        bodies.velocity[env, b] = velocity
+    def kinematics(q: wp.array2d(dtype=real), v: wp.array2d(dtype=real), topology: Topology, bodies: Bodies, stride: int):
+        start, b = wp.tid()
+        for env in range(start, q.shape[0], stride):
+            if topology.joint_type[b] == FIXED:
+                bodies.pose[env, b] = topology.joint_pose[b]
+                bodies.velocity[env, b] = spatial()
+                continue
+            i = topology.q_start[b]
+            j = topology.v_start[b]
+            pose = transform()
+            velocity = spatial()
+            for k in range(7):
+                pose[k] = q[env, i + k]
+            for k in range(6):
+                velocity[k] = v[env, j + k]
+            bodies.pose[env, b] = pose
+            bodies.velocity[env, b] = velocity
 
     @wp.kernel(module="unique", enable_backward=False)
     def free_motion(
@@ -70,29 +71,31 @@ def make(real) -> SimpleNamespace:
         wrench: wp.array2d(dtype=spatial),
         h: real,
         bodies: Bodies,
+        stride: int,
     ):
-        env, b = wp.tid()
-        pose = bodies.pose[env, b]
-        velocity = bodies.velocity[env, b]
-        bodies.com[env, b] = wp.transform_point(pose, parameters.com[env % parameters.com.shape[0], b])
-        if topology.joint_type[b] != FREE:
-            bodies.inv_mass[env, b] = real(0.0)
-            bodies.inv_inertia[env, b] = mat33()
-            bodies.free_velocity[env, b] = velocity
-            return
+        start, b = wp.tid()
+        for env in range(start, wrench.shape[0], stride):
+            pose = bodies.pose[env, b]
+            velocity = bodies.velocity[env, b]
+            bodies.com[env, b] = wp.transform_point(pose, parameters.com[env % parameters.com.shape[0], b])
+            if topology.joint_type[b] != FREE:
+                bodies.inv_mass[env, b] = real(0.0)
+                bodies.inv_inertia[env, b] = mat33()
+                bodies.free_velocity[env, b] = velocity
+                continue
 
-        inv_mass = real(1.0) / parameters.mass[env % parameters.mass.shape[0], b]
-        inertia = parameters.inertia[env % parameters.inertia.shape[0], b]
-        gravity = parameters.gravity[env % parameters.gravity.shape[0]]
-        force = wp.spatial_top(wrench[env, b])
-        torque = wp.spatial_bottom(wrench[env, b])
-        rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+            inv_mass = real(1.0) / parameters.mass[env % parameters.mass.shape[0], b]
+            inertia = parameters.inertia[env % parameters.inertia.shape[0], b]
+            gravity = parameters.gravity[env % parameters.gravity.shape[0]]
+            force = wp.spatial_top(wrench[env, b])
+            torque = wp.spatial_bottom(wrench[env, b])
+            rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
 
-        v = wp.spatial_top(velocity) + h * (gravity + inv_mass * force)
-        w = wp.transpose(rotation) * wp.spatial_bottom(velocity)
-        w = rotation * gyroscopic_midpoint(inertia, w, wp.transpose(rotation) * torque, h)
-        bodies.inv_mass[env, b] = inv_mass
-        bodies.inv_inertia[env, b] = rotation * wp.inverse(inertia) * wp.transpose(rotation)
-        bodies.free_velocity[env, b] = spatial(v[0], v[1], v[2], w[0], w[1], w[2])
+            v = wp.spatial_top(velocity) + h * (gravity + inv_mass * force)
+            w = wp.transpose(rotation) * wp.spatial_bottom(velocity)
+            w = rotation * gyroscopic_midpoint(inertia, w, wp.transpose(rotation) * torque, h)
+            bodies.inv_mass[env, b] = inv_mass
+            bodies.inv_inertia[env, b] = rotation * wp.inverse(inertia) * wp.transpose(rotation)
+            bodies.free_velocity[env, b] = spatial(v[0], v[1], v[2], w[0], w[1], w[2])
 
     return SimpleNamespace(kinematics=kinematics, free_motion=free_motion)

@@ -221,56 +221,57 @@ def make(real):
         write(slots, env, slot, point, wp.transform_vector(xa, n), wp.dot(n, offset), feature)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def box_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
-        env, index = wp.tid()
-        pair = first + index
-        sa = topology.pairs[pair, 0]
-        sb = topology.pairs[pair, 1]
-        xa = shape_pose(topology, bodies, env, sa)
-        xb = shape_pose(topology, bodies, env, sb)
-        ha = topology.shape_size[sa]
-        hb = topology.shape_size[sb]
-        ca = wp.transform_get_translation(xa)
-        cb = wp.transform_get_translation(xb)
-        slot = topology.pair_slots[pair]
-        count = int(0)
+    def box_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+        start, index = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            pair = first + index
+            sa = topology.pairs[pair, 0]
+            sb = topology.pairs[pair, 1]
+            xa = shape_pose(topology, bodies, env, sa)
+            xb = shape_pose(topology, bodies, env, sb)
+            ha = topology.shape_size[sa]
+            hb = topology.shape_size[sb]
+            ca = wp.transform_get_translation(xa)
+            cb = wp.transform_get_translation(xb)
+            slot = topology.pair_slots[pair]
+            count = int(0)
 
-        if wp.length(cb - ca) < reach(topology, bodies, env, sa, ca, h) + reach(topology, bodies, env, sb, cb, h):
-            rotation = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(xa))) * wp.quat_to_matrix(wp.transform_get_rotation(xb))
-            d = wp.transform_point(wp.transform_inverse(xa), cb)
-            db = wp.transpose(rotation) * d
-            # Prefer faces over edges and a over b, so that equal separations do not flip from step to step.
-            bias = real(1.0e-3) * wp.min(wp.min(ha), wp.min(hb))
-            best = face_separation(d, rotation, ha, hb, 0)
-            axis = int(0)
-            for k in range(1, 3):
-                s = face_separation(d, rotation, ha, hb, k)
-                if s > best:
-                    best = s
-                    axis = k
-            best_b = best + bias
-            for k in range(3):
-                s = face_separation(db, wp.transpose(rotation), hb, ha, k)
-                if s > best_b:
-                    best_b = s
-                    best = s
-                    axis = 3 + k
-            best_edge = best + bias
-            for ij in range(9):
-                n = edge_axis(rotation, ij // 3, ij % 3)
-                if wp.dot(n, n) > real(0.0):
-                    s = edge_separation(d, rotation, ha, hb, n)
-                    if s > best_edge:
-                        best_edge = s
-                        axis = 6 + ij
-            if axis < 3:
-                count = face_contacts(slots, env, slot, xa, ha, xb, hb, axis, False)
-            elif axis < 6:
-                count = face_contacts(slots, env, slot, xb, hb, xa, ha, axis - 3, True)
-            else:
-                edge_contact(slots, env, slot, xa, ha, xb, hb, rotation, (axis - 6) // 3, (axis - 6) % 3)
-                count = 1
-        for k in range(count, 8):
-            slots.gap[env, slot + k] = real(NO_POINT)
+            if wp.length(cb - ca) < reach(topology, bodies, env, sa, ca, h) + reach(topology, bodies, env, sb, cb, h):
+                rotation = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(xa))) * wp.quat_to_matrix(wp.transform_get_rotation(xb))
+                d = wp.transform_point(wp.transform_inverse(xa), cb)
+                db = wp.transpose(rotation) * d
+                # Prefer faces over edges and a over b, so that equal separations do not flip from step to step.
+                bias = real(1.0e-3) * wp.min(wp.min(ha), wp.min(hb))
+                best = face_separation(d, rotation, ha, hb, 0)
+                axis = int(0)
+                for k in range(1, 3):
+                    s = face_separation(d, rotation, ha, hb, k)
+                    if s > best:
+                        best = s
+                        axis = k
+                best_b = best + bias
+                for k in range(3):
+                    s = face_separation(db, wp.transpose(rotation), hb, ha, k)
+                    if s > best_b:
+                        best_b = s
+                        best = s
+                        axis = 3 + k
+                best_edge = best + bias
+                for ij in range(9):
+                    n = edge_axis(rotation, ij // 3, ij % 3)
+                    if wp.dot(n, n) > real(0.0):
+                        s = edge_separation(d, rotation, ha, hb, n)
+                        if s > best_edge:
+                            best_edge = s
+                            axis = 6 + ij
+                if axis < 3:
+                    count = face_contacts(slots, env, slot, xa, ha, xb, hb, axis, False)
+                elif axis < 6:
+                    count = face_contacts(slots, env, slot, xb, hb, xa, ha, axis - 3, True)
+                else:
+                    edge_contact(slots, env, slot, xa, ha, xb, hb, rotation, (axis - 6) // 3, (axis - 6) % 3)
+                    count = 1
+            for k in range(count, 8):
+                slots.gap[env, slot + k] = real(NO_POINT)
 
     return box_box

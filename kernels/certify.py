@@ -84,86 +84,89 @@ def make(real) -> SimpleNamespace:
         residual: wp.array(dtype=real),
         residual_energy: wp.array(dtype=real),
         status: wp.array(dtype=int),
+        stride: int,
     ):
-        env = wp.tid()
-        if unsolved[env] == 0:
-            return
-        r = contacts.count[env]
-        for b in range(next_velocity.shape[1]):
-            next_velocity[env, b] = bodies.free_velocity[env, b]
-        for i in range(r):
-            impulse = wp.transpose(contacts.frame[env, i]) * contacts.impulse[env, i]
-            for side in range(2):
-                b = contacts.body[env, i][side]
-                if b >= 0:
-                    arm = contacts.point[env, i] - bodies.com[env, b]
-                    sign = real(2 * side - 1)
-                    next_velocity[env, b] += push(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * impulse)
+        start, _ = wp.tid()
+        for env in range(start, contacts.count.shape[0], stride):
+            if unsolved[env] == 0:
+                continue
+            r = contacts.count[env]
+            for b in range(next_velocity.shape[1]):
+                next_velocity[env, b] = bodies.free_velocity[env, b]
+            for i in range(r):
+                impulse = wp.transpose(contacts.frame[env, i]) * contacts.impulse[env, i]
+                for side in range(2):
+                    b = contacts.body[env, i][side]
+                    if b >= 0:
+                        arm = contacts.point[env, i] - bodies.com[env, b]
+                        sign = real(2 * side - 1)
+                        next_velocity[env, b] += push(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * impulse)
 
-        worst = real(0.0)
-        energy = real(0.0)
-        finite = bool(True)
-        for b in range(next_velocity.shape[1]):
-            finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
-        for i in range(r):
-            p = contacts.impulse[env, i]
-            eps = contacts.relaxation[env, i]
-            d = contacts.shift[env, i]
-            du = vec3()
-            for side in range(2):
-                b = contacts.body[env, i][side]
-                if b >= 0:
-                    arm = contacts.point[env, i] - bodies.com[env, b]
-                    du += real(2 * side - 1) * change(next_velocity[env, b] - bodies.free_velocity[env, b], arm)
-            relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
-            mass = wp.cw_div(vec3(real(1.0)), contacts.inv_mass[env, i] + eps)
-            k = contacts.directions[env, i]
-            if k > 2:
-                mass[1] = real(2.0) / (real(1.0) / mass[1] + real(1.0) / mass[2])
-                mass[2] = mass[1]
-            p_t = vec2(p[1], p[2])
-            target = project_friction(p_t - vec2(mass[1] * relaxed[1], mass[2] * relaxed[2]), p[0], contacts.mu[env, i], k)
-            error = vec3(wp.min(relaxed[0], p[0] / mass[0]), (p_t[0] - target[0]) / mass[1], (p_t[1] - target[1]) / mass[2])
-            worst = wp.max(worst, wp.max(wp.abs(error)))
-            energy += real(0.5) * wp.dot(wp.cw_mul(mass, error), error)
-            contacts.velocity[env, i] = relaxed - wp.cw_mul(eps, p) - d
-            state = OPEN
-            if p[0] > real(0.0):
-                state = STICK
-                pressed = p_t * (real(1.0) + real(1.0e-6))  # not real(1.0 + ...): literals add up in single precision
-                inside = project_friction(pressed, p[0], contacts.mu[env, i], k) - pressed
-                if k > 0 and wp.dot(inside, inside) > real(0.0):
-                    state = SLIDE
-            contacts.state[env, i] = state
+            worst = real(0.0)
+            energy = real(0.0)
+            finite = bool(True)
+            for b in range(next_velocity.shape[1]):
+                finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
+            for i in range(r):
+                p = contacts.impulse[env, i]
+                eps = contacts.relaxation[env, i]
+                d = contacts.shift[env, i]
+                du = vec3()
+                for side in range(2):
+                    b = contacts.body[env, i][side]
+                    if b >= 0:
+                        arm = contacts.point[env, i] - bodies.com[env, b]
+                        du += real(2 * side - 1) * change(next_velocity[env, b] - bodies.free_velocity[env, b], arm)
+                relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
+                w = contacts.inv_mass[env, i] + eps  # 1 / m
+                k = contacts.directions[env, i]
+                if k > 2:  # the projection on a polygon needs one mass for both axes
+                    w[1] = real(0.5) * (w[1] + w[2])
+                    w[2] = w[1]
+                p_t = vec2(p[1], p[2])
+                target = project_friction(p_t - vec2(relaxed[1] / w[1], relaxed[2] / w[2]), p[0], contacts.mu[env, i], k)
+                error = vec3(wp.min(relaxed[0], p[0] * w[0]), (p_t[0] - target[0]) * w[1], (p_t[1] - target[1]) * w[2])
+                worst = wp.max(worst, wp.max(wp.abs(error)))
+                energy += real(0.5) * wp.dot(wp.cw_div(error, w), error)
+                contacts.velocity[env, i] = relaxed - wp.cw_mul(eps, p) - d
+                state = OPEN
+                if p[0] > real(0.0):
+                    state = STICK
+                    pressed = p_t * (real(1.0) + real(1.0e-6))  # not real(1.0 + ...): literals add up in single precision
+                    inside = project_friction(pressed, p[0], contacts.mu[env, i], k) - pressed
+                    if k > 0 and wp.dot(inside, inside) > real(0.0):
+                        state = SLIDE
+                contacts.state[env, i] = state
 
-        residual[env] = worst
-        residual_energy[env] = energy
-        solved = finite and worst <= tolerance
-        if not finite:
-            status[env] = status[env] | NOT_A_NUMBER
-        if solved:
-            unsolved[env] = 0
-        if final != 0 and finite and not solved:
-            status[env] = status[env] | UNCERTIFIED
+            residual[env] = worst
+            residual_energy[env] = energy
+            solved = finite and worst <= tolerance
+            if not finite:
+                status[env] = status[env] | NOT_A_NUMBER
+            if solved:
+                unsolved[env] = 0
+            if final != 0 and finite and not solved:
+                status[env] = status[env] | UNCERTIFIED
 
     @wp.kernel(module="unique", enable_backward=False)
-    def remember(h: real, contacts: Contacts, slots: Slots):
+    def remember(h: real, contacts: Contacts, slots: Slots, stride: int):
         """History for the next step: which features touched, with what normal impulse and bristle force."""
-        env = wp.tid()
-        for slot in range(slots.last_feature.shape[1]):
-            slots.last_feature[env, slot] = -1
-        for i in range(contacts.count[env]):
-            slot = contacts.slot[env, i]
-            p = contacts.impulse[env, i]
-            # An unloaded contact is remembered as such; one that never closed will be new when it does.
-            if p[0] > real(0.0) or contacts.closed[env, i] != 0:
-                u = contacts.velocity[env, i]
-                b_t = contacts.damping[env, i]
-                frame = contacts.frame[env, i]
-                bristle = vec3(real(0.0), p[1] / h + b_t * u[1], p[2] / h + b_t * u[2])
-                slots.last_feature[env, slot] = slots.feature[env, slot]
-                slots.last_impulse[env, slot] = p[0]
-                slots.last_bristle[env, slot] = wp.transpose(frame) * bristle
+        start, _ = wp.tid()
+        for env in range(start, contacts.count.shape[0], stride):
+            for slot in range(slots.last_feature.shape[1]):
+                slots.last_feature[env, slot] = -1
+            for i in range(contacts.count[env]):
+                slot = contacts.slot[env, i]
+                p = contacts.impulse[env, i]
+                # An unloaded contact is remembered as such; one that never closed will be new when it does.
+                if p[0] > real(0.0) or contacts.closed[env, i] != 0:
+                    u = contacts.velocity[env, i]
+                    b_t = contacts.damping[env, i]
+                    frame = contacts.frame[env, i]
+                    bristle = vec3(real(0.0), p[1] / h + b_t * u[1], p[2] / h + b_t * u[2])
+                    slots.last_feature[env, slot] = slots.feature[env, slot]
+                    slots.last_impulse[env, slot] = p[0]
+                    slots.last_bristle[env, slot] = wp.transpose(frame) * bristle
 
     @wp.kernel(module="unique", enable_backward=False)
     def integrate(
@@ -173,27 +176,29 @@ def make(real) -> SimpleNamespace:
         h: real,
         q: wp.array2d(dtype=real),
         v: wp.array2d(dtype=real),
+        stride: int,
     ):
         """q+ = q + h Gamma(q) v+ (eq. 23): the centre of mass moves straight, the body turns about it."""
-        env, b = wp.tid()
-        if topology.joint_type[b] == FIXED:
-            return
-        i = topology.q_start[b]
-        j = topology.v_start[b]
-        velocity = next_velocity[env, b]
-        pose = bodies.pose[env, b]
-        w = wp.spatial_bottom(velocity)
-        angle = h * wp.length(w)
-        turn = wp.quat_identity(dtype=real)
-        if angle > real(0.0):
-            turn = wp.quat_from_axis_angle(wp.normalize(w), angle)
-        rotation = wp.normalize(turn * wp.transform_get_rotation(pose))
-        com = bodies.com[env, b]
-        offset = wp.quat_rotate(turn, wp.transform_get_translation(pose) - com)
-        pose = transform(com + h * wp.spatial_top(velocity) + offset, rotation)
-        for k in range(7):
-            q[env, i + k] = pose[k]
-        for k in range(6):
-            v[env, j + k] = velocity[k]
+        start, b = wp.tid()
+        for env in range(start, q.shape[0], stride):
+            if topology.joint_type[b] == FIXED:
+                continue
+            i = topology.q_start[b]
+            j = topology.v_start[b]
+            velocity = next_velocity[env, b]
+            pose = bodies.pose[env, b]
+            w = wp.spatial_bottom(velocity)
+            angle = h * wp.length(w)
+            turn = wp.quat_identity(dtype=real)
+            if angle > real(0.0):
+                turn = wp.quat_from_axis_angle(wp.normalize(w), angle)
+            rotation = wp.normalize(turn * wp.transform_get_rotation(pose))
+            com = bodies.com[env, b]
+            offset = wp.quat_rotate(turn, wp.transform_get_translation(pose) - com)
+            pose = transform(com + h * wp.spatial_top(velocity) + offset, rotation)
+            for k in range(7):
+                q[env, i + k] = pose[k]
+            for k in range(6):
+                v[env, j + k] = velocity[k]
 
     return SimpleNamespace(certify=certify, remember=remember, integrate=integrate)

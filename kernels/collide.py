@@ -55,93 +55,97 @@ def make(real) -> dict:
     shape_pose, write = f.shape_pose, f.write
 
     @wp.kernel(module="unique", enable_backward=False)
-    def plane_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
-        env, i = wp.tid()
-        pair = first + i
-        plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
-        centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
-        radius = topology.shape_size[topology.pairs[pair, 1]][0]
-        normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
-        gap = wp.dot(normal, centre - wp.transform_get_translation(plane)) - radius
-        point = centre - normal * (radius + real(0.5) * gap)
-        write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
+    def plane_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+        start, i = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            pair = first + i
+            plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
+            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
+            radius = topology.shape_size[topology.pairs[pair, 1]][0]
+            normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
+            gap = wp.dot(normal, centre - wp.transform_get_translation(plane)) - radius
+            point = centre - normal * (radius + real(0.5) * gap)
+            write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def plane_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
-        env, i = wp.tid()
-        pair = first + i
-        plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
-        box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
-        size = topology.shape_size[topology.pairs[pair, 1]]
-        normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
-        origin = wp.transform_get_translation(plane)
-        slot = topology.pair_slots[pair]
-        for k in range(8):
-            corner = size
-            if (k & 1) == 0:
-                corner[0] = -size[0]
-            if (k & 2) == 0:
-                corner[1] = -size[1]
-            if (k & 4) == 0:
-                corner[2] = -size[2]
-            vertex = wp.transform_point(box, corner)
-            gap = wp.dot(normal, vertex - origin)
-            write(slots, env, slot + k, vertex - normal * (real(0.5) * gap), normal, gap, k)
+    def plane_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+        start, i = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            pair = first + i
+            plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
+            box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
+            size = topology.shape_size[topology.pairs[pair, 1]]
+            normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
+            origin = wp.transform_get_translation(plane)
+            slot = topology.pair_slots[pair]
+            for k in range(8):
+                corner = size
+                if (k & 1) == 0:
+                    corner[0] = -size[0]
+                if (k & 2) == 0:
+                    corner[1] = -size[1]
+                if (k & 4) == 0:
+                    corner[2] = -size[2]
+                vertex = wp.transform_point(box, corner)
+                gap = wp.dot(normal, vertex - origin)
+                write(slots, env, slot + k, vertex - normal * (real(0.5) * gap), normal, gap, k)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def sphere_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
-        env, i = wp.tid()
-        pair = first + i
-        a = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
-        b = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
-        ra = topology.shape_size[topology.pairs[pair, 0]][0]
-        rb = topology.shape_size[topology.pairs[pair, 1]][0]
-        offset = b - a
-        distance = wp.length(offset)
-        normal = vec3(real(0.0), real(0.0), real(1.0))  # concentric spheres have none: any will part them
-        if distance > real(0.0):
-            normal = offset / distance
-        gap = distance - ra - rb
-        write(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, 0)
+    def sphere_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+        start, i = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            pair = first + i
+            a = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
+            b = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
+            ra = topology.shape_size[topology.pairs[pair, 0]][0]
+            rb = topology.shape_size[topology.pairs[pair, 1]][0]
+            offset = b - a
+            distance = wp.length(offset)
+            normal = vec3(real(0.0), real(0.0), real(1.0))  # concentric spheres have none: any will part them
+            if distance > real(0.0):
+                normal = offset / distance
+            gap = distance - ra - rb
+            write(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, 0)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def sphere_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots):
-        env, i = wp.tid()
-        pair = first + i
-        centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
-        radius = topology.shape_size[topology.pairs[pair, 0]][0]
-        box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
-        size = topology.shape_size[topology.pairs[pair, 1]]
-        local = wp.transform_point(wp.transform_inverse(box), centre)
-        nearest = vec3(
-            wp.clamp(local[0], -size[0], size[0]),
-            wp.clamp(local[1], -size[1], size[1]),
-            wp.clamp(local[2], -size[2], size[2]),
-        )
-        inward = nearest - local
-        distance = wp.length(inward)
-        if distance > real(0.0):
-            inward = inward / distance
-        else:
-            # The centre is inside: leave through the nearest face.
-            axis = int(0)
-            depth = size[0] - wp.abs(local[0])
-            for k in range(1, 3):
-                d = size[k] - wp.abs(local[k])
-                if d < depth:
-                    depth = d
-                    axis = k
-            side = real(1.0)
-            if local[axis] < real(0.0):
-                side = real(-1.0)
-            inward = vec3()
-            inward[axis] = -side
-            nearest[axis] = side * size[axis]
-            distance = -depth
-        normal = wp.transform_vector(box, inward)
-        gap = distance - radius
-        point = wp.transform_point(box, nearest) - normal * (real(0.5) * gap)
-        write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
+    def sphere_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+        start, i = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            pair = first + i
+            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
+            radius = topology.shape_size[topology.pairs[pair, 0]][0]
+            box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
+            size = topology.shape_size[topology.pairs[pair, 1]]
+            local = wp.transform_point(wp.transform_inverse(box), centre)
+            nearest = vec3(
+                wp.clamp(local[0], -size[0], size[0]),
+                wp.clamp(local[1], -size[1], size[1]),
+                wp.clamp(local[2], -size[2], size[2]),
+            )
+            inward = nearest - local
+            distance = wp.length(inward)
+            if distance > real(0.0):
+                inward = inward / distance
+            else:
+                # The centre is inside: leave through the nearest face.
+                axis = int(0)
+                depth = size[0] - wp.abs(local[0])
+                for k in range(1, 3):
+                    d = size[k] - wp.abs(local[k])
+                    if d < depth:
+                        depth = d
+                        axis = k
+                side = real(1.0)
+                if local[axis] < real(0.0):
+                    side = real(-1.0)
+                inward = vec3()
+                inward[axis] = -side
+                nearest[axis] = side * size[axis]
+                distance = -depth
+            normal = wp.transform_vector(box, inward)
+            gap = distance - radius
+            point = wp.transform_point(box, nearest) - normal * (real(0.5) * gap)
+            write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
 
     return {
         ("PLANE", "SPHERE"): plane_sphere,

@@ -93,12 +93,12 @@ def row_functions(real) -> SimpleNamespace:
         return x - n * wp.dot(n, x)
 
     @wp.func
-    def any_tangent(n: vec3) -> vec3:
-        """World x (or y where the normal is near x) projected on the tangent plane."""
+    def any_axis(n: vec3) -> vec3:
+        """World x, or y where the normal is near x: fixed facets start from its projection on the tangent plane."""
         axis = vec3(real(1.0), real(0.0), real(0.0))
         if wp.abs(n[0]) > real(0.9):
             axis = vec3(real(0.0), real(1.0), real(0.0))
-        return wp.normalize(tangent_part(axis, n))
+        return axis
 
     @wp.func
     def make_row(
@@ -156,28 +156,27 @@ def row_functions(real) -> SimpleNamespace:
         d_t = -(eps_t * h) * bristle  # eq. 42
         mu_row = vec2(mu, mu)
         k = directions
-        t1 = any_tangent(n)
-        if sliding != FACETS:
-            if slides:
+        # t1 lies along the slip, or along the slip to come: there the limit of a sticking contact is mu_s lambda_n exactly.
+        along = slip
+        if not slides:
+            along = tangent_part(u_free, n) + d_t
+        aligned = slides or wp.length_sq(along) > real(NO_SLIP * NO_SLIP) * wp.length_sq(u_free)
+        if sliding == FACETS or not aligned:
+            along = any_axis(n)
+        t1 = wp.normalize(tangent_part(along, n))  # once more: a small slip is a difference of large numbers
+        if slides:
+            if sliding == FACETS:
+                d_t = vec3()
+            else:
                 # Eq. 34, and eq. 43 across the sliding direction.
-                t1 = slip / speed
                 d_t = t1 * wp.dot(t1, d_t)
                 k = 2
                 if sliding == REGULARIZED and mu > real(0.0):
                     eps[2] = wp.max(eps_t, speed / (mu * wp.max(impulse, real(IMPULSE_FLOOR) * weight)))
                 else:
                     mu_row[1] = real(0.0)
-            else:
-                # First direction along the slip to come, so that the limit there is mu_s lambda_n exactly.
-                predicted = tangent_part(u_free, n) + d_t
-                length = wp.length(predicted)
-                if length > real(NO_SLIP) * wp.length(u_free):
-                    t1 = predicted / length
-        elif slides:
-            d_t = vec3()
         if mu == real(0.0):
             k = 0
-        t1 = wp.normalize(tangent_part(t1, n))  # once more: a small slip is a difference of large numbers
         t2 = wp.cross(n, t1)
 
         row = Row()
@@ -218,42 +217,50 @@ def make(real) -> SimpleNamespace:
 
     @wp.kernel(module="unique", enable_backward=False)
     def select_contacts(
-        topology: Topology, parameters: Parameters, bodies: Bodies, slots: Slots, h: real, contacts: Contacts, status: wp.array(dtype=int)
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        slots: Slots,
+        h: real,
+        contacts: Contacts,
+        status: wp.array(dtype=int),
+        stride: int,
     ):
         """The slots whose gap could close within the step, in order, and the relative velocities there."""
-        env = wp.tid()
-        fall = h * h * wp.length(parameters.gravity[env % parameters.gravity.shape[0]]) + real(1.0e-9)
-        count = int(0)
-        for slot in range(slots.gap.shape[1]):
-            phi = slots.gap[env, slot]
-            if phi < real(NO_POINT):
-                pair = topology.slot_pair[slot]
-                u = vec3()
-                u_free = vec3()
-                for side in range(2):
-                    sign = real(2 * side - 1)
-                    shape = topology.pairs[pair, side]
-                    b = topology.shape_body[shape]
-                    belt = topology.surface_velocity[shape]
-                    if wp.dot(belt, belt) > real(0.0):
-                        belt = sign * wp.transform_vector(shape_pose(topology, bodies, env, shape), belt)
-                        u += belt
-                        u_free += belt
-                    if b >= 0:
-                        arm = slots.point[env, slot] - bodies.com[env, b]
-                        u += sign * point_velocity(bodies.velocity[env, b], arm)
-                        u_free += sign * point_velocity(bodies.free_velocity[env, b], arm)
-                # The speed counts, not just its approaching part: an impact elsewhere on the body turns one into the
-                # other (1.1 mm of overlap at 1 ms without, 3 um with).
-                if phi < h * wp.length(u_free) + fall:
-                    if count < contacts.slot.shape[1]:
-                        contacts.slot[env, count] = slot
-                        contacts.velocity[env, count] = u
-                        contacts.free[env, count] = u_free
-                        count += 1
-                    else:
-                        status[env] = status[env] | OVERFLOW
-        contacts.count[env] = count
+        start, _ = wp.tid()
+        for env in range(start, contacts.count.shape[0], stride):
+            fall = h * h * wp.length(parameters.gravity[env % parameters.gravity.shape[0]]) + real(1.0e-9)
+            count = int(0)
+            for slot in range(slots.gap.shape[1]):
+                phi = slots.gap[env, slot]
+                if phi < real(NO_POINT):
+                    pair = topology.slot_pair[slot]
+                    u = vec3()
+                    u_free = vec3()
+                    for side in range(2):
+                        sign = real(2 * side - 1)
+                        shape = topology.pairs[pair, side]
+                        b = topology.shape_body[shape]
+                        belt = topology.surface_velocity[shape]
+                        if wp.dot(belt, belt) > real(0.0):
+                            belt = sign * wp.transform_vector(shape_pose(topology, bodies, env, shape), belt)
+                            u += belt
+                            u_free += belt
+                        if b >= 0:
+                            arm = slots.point[env, slot] - bodies.com[env, b]
+                            u += sign * point_velocity(bodies.velocity[env, b], arm)
+                            u_free += sign * point_velocity(bodies.free_velocity[env, b], arm)
+                    # The speed counts, not just its approaching part: an impact elsewhere on the body turns one into the
+                    # other (1.1 mm of overlap at 1 ms without, 3 um with).
+                    if phi < h * wp.length(u_free) + fall:
+                        if count < contacts.slot.shape[1]:
+                            contacts.slot[env, count] = slot
+                            contacts.velocity[env, count] = u
+                            contacts.free[env, count] = u_free
+                            count += 1
+                        else:
+                            status[env] = status[env] | OVERFLOW
+            contacts.count[env] = count
 
     @wp.kernel(module="unique", enable_backward=False)
     def contact_rows(
@@ -265,57 +272,59 @@ def make(real) -> SimpleNamespace:
         sliding: int,
         directions: int,
         contacts: Contacts,
+        stride: int,
     ):
         """Rows of the selected contacts; velocity and free hold world axes before, the contact frame after."""
-        env, i = wp.tid()
-        if i >= contacts.count[env]:
-            return
-        slot = contacts.slot[env, i]
-        pair = topology.slot_pair[slot]
-        point = slots.point[env, slot]
-        phi = slots.gap[env, slot]
-        g = wp.length(parameters.gravity[env % parameters.gravity.shape[0]])
-        mobility = mat33()
-        mass = real(0.0)  # of the lighter movable body
-        mu = vec2()
-        c_a = vec5()
-        c_b = vec5()
-        body = wp.vec2i()
-        for side in range(2):
-            shape = topology.pairs[pair, side]
-            b = topology.shape_body[shape]
-            body[side] = b
-            mu += real(0.5) * parameters.friction[env % parameters.friction.shape[0], shape]
-            for k in range(5):
-                c_a[k] = c_b[k]
-                c_b[k] = parameters.contact[env % parameters.contact.shape[0], shape, k]
-            if b >= 0 and topology.joint_type[b] == FREE:
-                inv_mass = bodies.inv_mass[env, b]
-                mobility += side_mobility(inv_mass, bodies.inv_inertia[env, b], point - bodies.com[env, b])
-                if mass == real(0.0) or real(1.0) / inv_mass < mass:
-                    mass = real(1.0) / inv_mass
-        c = contact_parameters(c_a, c_b, mass)
-        history = History()
-        history.touched = slots.last_feature[env, slot] == slots.feature[env, slot]
-        history.impulse = slots.last_impulse[env, slot]
-        history.bristle = slots.last_bristle[env, slot]
-        u = contacts.velocity[env, i]
-        u_free = contacts.free[env, i]
-        row = make_row(mobility, slots.normal[env, slot], phi, u, u_free, c, mu, history, g, h, sliding, directions)
+        start, i = wp.tid()
+        for env in range(start, contacts.count.shape[0], stride):
+            if i >= contacts.count[env]:
+                continue
+            slot = contacts.slot[env, i]
+            pair = topology.slot_pair[slot]
+            point = slots.point[env, slot]
+            phi = slots.gap[env, slot]
+            g = wp.length(parameters.gravity[env % parameters.gravity.shape[0]])
+            mobility = mat33()
+            mass = real(0.0)  # of the lighter movable body
+            mu = vec2()
+            c_a = vec5()
+            c_b = vec5()
+            body = wp.vec2i()
+            for side in range(2):
+                shape = topology.pairs[pair, side]
+                b = topology.shape_body[shape]
+                body[side] = b
+                mu += real(0.5) * parameters.friction[env % parameters.friction.shape[0], shape]
+                for k in range(5):
+                    c_a[k] = c_b[k]
+                    c_b[k] = parameters.contact[env % parameters.contact.shape[0], shape, k]
+                if b >= 0 and topology.joint_type[b] == FREE:
+                    m = parameters.mass[env % parameters.mass.shape[0], b]
+                    mobility += side_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], point - bodies.com[env, b])
+                    if mass == real(0.0) or m < mass:
+                        mass = m
+            c = contact_parameters(c_a, c_b, mass)
+            history = History()
+            history.touched = slots.last_feature[env, slot] == slots.feature[env, slot]
+            history.impulse = slots.last_impulse[env, slot]
+            history.bristle = slots.last_bristle[env, slot]
+            u = contacts.velocity[env, i]
+            u_free = contacts.free[env, i]
+            row = make_row(mobility, slots.normal[env, slot], phi, u, u_free, c, mu, history, g, h, sliding, directions)
 
-        contacts.body[env, i] = body
-        contacts.point[env, i] = point
-        contacts.gap[env, i] = phi
-        contacts.closed[env, i] = int(row.closed)
-        contacts.frame[env, i] = row.frame
-        contacts.inv_mass[env, i] = row.inv_mass
-        contacts.relaxation[env, i] = row.relaxation
-        contacts.shift[env, i] = row.shift
-        contacts.free[env, i] = row.frame * u_free + row.shift
-        contacts.mu[env, i] = row.mu
-        contacts.directions[env, i] = row.directions
-        contacts.damping[env, i] = c[3]
-        contacts.impulse[env, i] = vec3()
-        contacts.state[env, i] = row.state
+            contacts.body[env, i] = body
+            contacts.point[env, i] = point
+            contacts.gap[env, i] = phi
+            contacts.closed[env, i] = int(row.closed)
+            contacts.frame[env, i] = row.frame
+            contacts.inv_mass[env, i] = row.inv_mass
+            contacts.relaxation[env, i] = row.relaxation
+            contacts.shift[env, i] = row.shift
+            contacts.free[env, i] = row.frame * u_free + row.shift
+            contacts.mu[env, i] = row.mu
+            contacts.directions[env, i] = row.directions
+            contacts.damping[env, i] = c[3]
+            contacts.impulse[env, i] = vec3()
+            contacts.state[env, i] = row.state
 
     return SimpleNamespace(select_contacts=select_contacts, contact_rows=contact_rows)

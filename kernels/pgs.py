@@ -59,42 +59,44 @@ def make(real):
         velocity: wp.array2d(dtype=spatial),
         iterations: wp.array(dtype=int),
         status: wp.array(dtype=int),
+        stride: int,
     ):
-        env = wp.tid()
-        r = contacts.count[env]
-        for b in range(velocity.shape[1]):
-            velocity[env, b] = bodies.free_velocity[env, b]
-        change = real(0.0)
-        sweep = int(0)
-        searching = r > 0
-        while searching:
+        start, _ = wp.tid()
+        for env in range(start, contacts.count.shape[0], stride):
+            r = contacts.count[env]
+            for b in range(velocity.shape[1]):
+                velocity[env, b] = bodies.free_velocity[env, b]
             change = real(0.0)
-            for i in range(r):
-                body = contacts.body[env, i]
-                point = contacts.point[env, i]
-                frame = contacts.frame[env, i]
-                eps = contacts.relaxation[env, i]
-                diagonal = contacts.inv_mass[env, i] + eps
-                free = contacts.free[env, i]
-                p = contacts.impulse[env, i]
-                old = p
+            sweep = int(0)
+            searching = r > 0
+            while searching:
+                change = real(0.0)
+                for i in range(r):
+                    body = contacts.body[env, i]
+                    point = contacts.point[env, i]
+                    frame = contacts.frame[env, i]
+                    eps = contacts.relaxation[env, i]
+                    diagonal = contacts.inv_mass[env, i] + eps
+                    free = contacts.free[env, i]
+                    p = contacts.impulse[env, i]
+                    old = p
 
-                relaxed = free + frame * relative(bodies, velocity, env, body, point) + wp.cw_mul(eps, p)
-                p[0] = wp.max(p[0] - relaxed[0] / diagonal[0], real(0.0))
-                apply(bodies, velocity, env, body, point, frame[0] * (p[0] - old[0]))
-                k = contacts.directions[env, i]
-                if k > 0:
                     relaxed = free + frame * relative(bodies, velocity, env, body, point) + wp.cw_mul(eps, p)
-                    x = vec2(p[1] - relaxed[1] / diagonal[1], p[2] - relaxed[2] / diagonal[2])
-                    x = project_friction(x, p[0], contacts.mu[env, i], k)
-                    p = vec3(p[0], x[0], x[1])
-                    apply(bodies, velocity, env, body, point, frame[1] * (p[1] - old[1]) + frame[2] * (p[2] - old[2]))
-                contacts.impulse[env, i] = p
-                change = wp.max(change, wp.max(wp.abs(wp.cw_mul(diagonal, p - old))))
-            sweep += 1
-            searching = change > tolerance and sweep < sweeps
-        iterations[env] = iterations[env] + sweep
-        if change > tolerance:
-            status[env] = status[env] | ITERATION_LIMIT
+                    p[0] = wp.max(p[0] - relaxed[0] / diagonal[0], real(0.0))
+                    apply(bodies, velocity, env, body, point, frame[0] * (p[0] - old[0]))
+                    k = contacts.directions[env, i]
+                    if k > 0:
+                        relaxed = free + frame * relative(bodies, velocity, env, body, point) + wp.cw_mul(eps, p)
+                        x = vec2(p[1] - relaxed[1] / diagonal[1], p[2] - relaxed[2] / diagonal[2])
+                        x = project_friction(x, p[0], contacts.mu[env, i], k)
+                        p = vec3(p[0], x[0], x[1])
+                        apply(bodies, velocity, env, body, point, frame[1] * (p[1] - old[1]) + frame[2] * (p[2] - old[2]))
+                    contacts.impulse[env, i] = p
+                    change = wp.max(change, wp.max(wp.abs(wp.cw_mul(diagonal, p - old))))
+                sweep += 1
+                searching = change > tolerance and sweep < sweeps
+            iterations[env] = iterations[env] + sweep
+            if change > tolerance:
+                status[env] = status[env] | ITERATION_LIMIT
 
     return pgs

@@ -123,10 +123,11 @@ def make_single(real):
     @wp.func
     def solve(a: mat66, b: vec6) -> vec6:
         """Gaussian elimination; the certificate judges the answer, so no pivot search."""
+        p = vec6()
         for k in range(6):
-            p = real(1.0) / a[k, k]
+            p[k] = real(1.0) / a[k, k]
             for i in range(k + 1, 6):
-                g = a[i, k] * p
+                g = a[i, k] * p[k]
                 b[i] = b[i] - g * b[k]
                 for j in range(k + 1, 6):
                     a[i, j] = a[i, j] - g * a[k, j]
@@ -135,7 +136,7 @@ def make_single(real):
             x = b[k]
             for j in range(k + 1, 6):
                 x -= a[k, j] * b[j]
-            b[k] = x / a[k, k]
+            b[k] = x * p[k]
         return b
 
     @wp.func
@@ -148,14 +149,14 @@ def make_single(real):
                 j_t = row(frame[axis + 1], arm, sign)
                 s = axis_state(state, axis)
                 if s == AXIS_STICKS:
-                    scaled = j_t / eps[axis + 1]
+                    scaled = (real(1.0) / eps[axis + 1]) * j_t
                     a += wp.outer(scaled, j_t)
                     b -= scaled * free[axis + 1]
                 elif s == AXIS_SLIDES_UP:
                     column -= mu[axis] * j_t
                 else:
                     column += mu[axis] * j_t
-        column = column / eps[0]
+        column = (real(1.0) / eps[0]) * column
         a += wp.outer(column, j_n)
         b -= column * free[0]
         return a, b
@@ -168,69 +169,71 @@ def make_single(real):
         limit: int,
         tolerance: real,
         iterations: wp.array(dtype=int),
+        stride: int,
     ):
-        env = wp.tid()
-        r = contacts.count[env]
-        if r == 0:
-            return
-        com = bodies.com[env, body]
-        inertia = wp.inverse(bodies.inv_inertia[env, body])
-        m = real(1.0) / bodies.inv_mass[env, body]
-        x = vec6()
-        flips = int(1)
-        solves = int(0)
-        for i in range(r):
-            if contacts.directions[env, i] > 2:
-                flips = 0
-        while flips > 0 and solves < limit:
-            a = mat66(
-                m, real(0.0), real(0.0), real(0.0), real(0.0), real(0.0),
-                real(0.0), m, real(0.0), real(0.0), real(0.0), real(0.0),
-                real(0.0), real(0.0), m, real(0.0), real(0.0), real(0.0),
-                real(0.0), real(0.0), real(0.0), inertia[0, 0], inertia[0, 1], inertia[0, 2],
-                real(0.0), real(0.0), real(0.0), inertia[1, 0], inertia[1, 1], inertia[1, 2],
-                real(0.0), real(0.0), real(0.0), inertia[2, 0], inertia[2, 1], inertia[2, 2],
-            )  # fmt: skip
-            b = vec6()
+        start, _ = wp.tid()
+        for env in range(start, contacts.count.shape[0], stride):
+            r = contacts.count[env]
+            if r == 0:
+                continue
+            com = bodies.com[env, body]
+            inertia = wp.inverse(bodies.inv_inertia[env, body])
+            m = real(1.0) / bodies.inv_mass[env, body]
+            x = vec6()
+            flips = int(1)
+            solves = int(0)
             for i in range(r):
-                state = contacts.state[env, i]
-                if (state & CLOSED) != 0:
-                    sign = real(1.0)
+                if contacts.directions[env, i] > 2:
+                    flips = 0
+            while flips > 0 and solves < limit:
+                a = mat66(
+                    m, real(0.0), real(0.0), real(0.0), real(0.0), real(0.0),
+                    real(0.0), m, real(0.0), real(0.0), real(0.0), real(0.0),
+                    real(0.0), real(0.0), m, real(0.0), real(0.0), real(0.0),
+                    real(0.0), real(0.0), real(0.0), inertia[0, 0], inertia[0, 1], inertia[0, 2],
+                    real(0.0), real(0.0), real(0.0), inertia[1, 0], inertia[1, 1], inertia[1, 2],
+                    real(0.0), real(0.0), real(0.0), inertia[2, 0], inertia[2, 1], inertia[2, 2],
+                )  # fmt: skip
+                b = vec6()
+                for i in range(r):
+                    state = contacts.state[env, i]
+                    if (state & CLOSED) != 0:
+                        sign = real(1.0)
+                        if contacts.body[env, i][0] == body:
+                            sign = real(-1.0)
+                        a, b = add_contact(
+                            a,
+                            b,
+                            contacts.frame[env, i],
+                            contacts.point[env, i] - com,
+                            sign,
+                            contacts.relaxation[env, i],
+                            contacts.free[env, i],
+                            contacts.mu[env, i],
+                            contacts.directions[env, i],
+                            state,
+                        )
+                x = solve(a, b)
+                solves += 1
+                flips = int(0)
+                dv = vec3(x[0], x[1], x[2])
+                dw = vec3(x[3], x[4], x[5])
+                for i in range(r):
+                    du = dv + wp.cross(dw, contacts.point[env, i] - com)
                     if contacts.body[env, i][0] == body:
-                        sign = real(-1.0)
-                    a, b = add_contact(
-                        a,
-                        b,
-                        contacts.frame[env, i],
-                        contacts.point[env, i] - com,
-                        sign,
-                        contacts.relaxation[env, i],
-                        contacts.free[env, i],
-                        contacts.mu[env, i],
-                        contacts.directions[env, i],
-                        state,
-                    )
-            x = solve(a, b)
-            solves += 1
-            flips = int(0)
-            dv = vec3(x[0], x[1], x[2])
-            dw = vec3(x[3], x[4], x[5])
-            for i in range(r):
-                du = dv + wp.cross(dw, contacts.point[env, i] - com)
-                if contacts.body[env, i][0] == body:
-                    du = -du
-                relaxed = contacts.free[env, i] + contacts.frame[env, i] * du
-                eps = contacts.relaxation[env, i]
-                mu = contacts.mu[env, i]
-                k = contacts.directions[env, i]
-                state = contacts.state[env, i]
-                after = next_state(relaxed, eps, contacts.inv_mass[env, i][0], mu, k, state, tolerance)
-                if after != state:
-                    flips += 1
-                    contacts.state[env, i] = after
-                else:
-                    contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, k, state)
-        iterations[env] = iterations[env] + solves
+                        du = -du
+                    relaxed = contacts.free[env, i] + contacts.frame[env, i] * du
+                    eps = contacts.relaxation[env, i]
+                    mu = contacts.mu[env, i]
+                    k = contacts.directions[env, i]
+                    state = contacts.state[env, i]
+                    after = next_state(relaxed, eps, contacts.inv_mass[env, i][0], mu, k, state, tolerance)
+                    if after != state:
+                        flips += 1
+                        contacts.state[env, i] = after
+                    else:
+                        contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, k, state)
+            iterations[env] = iterations[env] + solves
 
     return pivot_single
 

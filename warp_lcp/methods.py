@@ -94,8 +94,7 @@ class VelocityPivoting:
     def launch(self, sim: Simulator) -> None:
         tail = [self.LIMIT, sim.sign_tolerance, sim.iterations]
         if self.single:
-            inputs = [sim.bodies, int(self.movable[0]), sim.rows, *tail]
-            wp.launch(self.kernel, dim=sim.num_envs, inputs=inputs, device=sim.device)
+            sim.launch(self.kernel, [sim.bodies, int(self.movable[0]), sim.rows, *tail])
         else:
             inputs = [sim.bodies, sim.rows, self.workspace, *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
@@ -114,8 +113,10 @@ class BlockPGS:
 
     def launch(self, sim: Simulator) -> None:
         # Sweeps end where no impulse changes a velocity by more than a hundredth of what certifies an answer.
-        inputs = [sim.bodies, sim.rows, self.SWEEPS, 0.01 * sim.tolerance, sim.next_velocity, sim.iterations, sim.status]
-        wp.launch(self.kernel, dim=sim.num_envs, inputs=inputs, device=sim.device)
+        sim.launch(
+            self.kernel,
+            [sim.bodies, sim.rows, self.SWEEPS, 0.01 * sim.tolerance, sim.next_velocity, sim.iterations, sim.status],
+        )
 
 
 #: Methods by the name that users give; each is tried on the environments that those before it left unsolved.

@@ -240,8 +240,7 @@ class Simulator:
         return self.bodies.velocity
 
     def _refresh_bodies(self) -> None:
-        inputs = [self.q, self.v, self.topology, self.bodies]
-        wp.launch(self._kernels.kinematics, dim=(self.num_envs, self.model.num_bodies), inputs=inputs, device=self.device)
+        self.launch(self._kernels.kinematics, [self.q, self.v, self.topology, self.bodies], self.model.num_bodies)
 
     @property
     def contacts(self) -> Contacts:
@@ -261,27 +260,33 @@ class Simulator:
 
     def _step_kernels(self) -> None:
         """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back."""
-        k, e, h, dev = self._kernels, self.num_envs, self.dt, self.device
-        body_dim = (e, self.model.num_bodies)
-        wp.launch(k.kinematics, dim=body_dim, inputs=[self.q, self.v, self.topology, self.bodies], device=dev)
-        wp.launch(k.free_motion, dim=body_dim, inputs=[self.topology, self.parameters, self.wrench, h, self.bodies], device=dev)
+        k, h, b, scene = self._kernels, self.dt, self.model.num_bodies, [self.topology, self.parameters]
+        self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
+        self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
         for kernel, first, number in self._pair_kernels:
-            wp.launch(kernel, dim=(e, number), inputs=[self.topology, self.bodies, first, h, self.slots], device=dev)
+            self.launch(kernel, [self.topology, self.bodies, first, h, self.slots], number)
         self.unsolved.fill_(1)
+        self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
         sliding = SLIDING.index(self.sliding)
-        scene = [self.topology, self.parameters, self.bodies, self.slots, h]
-        wp.launch(k.select_contacts, dim=e, inputs=[*scene, self.rows, self.status], device=dev)
-        inputs = [*scene, sliding, self.directions, self.rows]
-        wp.launch(k.contact_rows, dim=(e, self.model.max_contacts), inputs=inputs, device=dev)
+        rows = [*scene, self.bodies, self.slots, h, sliding, self.directions, self.rows]
+        self.launch(k.contact_rows, rows, self.model.max_contacts)
         for i, method in enumerate(self._methods):
             method.launch(self)
             final = int(i + 1 == len(self._methods))
             answer = [self.unsolved, self.residual, self.residual_energy, self.status]
-            inputs = [self.bodies, self.tolerance, final, self.next_velocity, self.rows, *answer]
-            wp.launch(k.certify, dim=e, inputs=inputs, device=dev)
-        wp.launch(k.remember, dim=e, inputs=[h, self.rows, self.slots], device=dev)
-        wp.launch(k.integrate, dim=body_dim, inputs=[self.topology, self.bodies, self.next_velocity, h, self.q, self.v], device=dev)
-        wp.launch(k.kinematics, dim=body_dim, inputs=[self.q, self.v, self.topology, self.bodies], device=dev)
+            self.launch(k.certify, [self.bodies, self.tolerance, final, self.next_velocity, self.rows, *answer])
+        self.launch(k.remember, [h, self.rows, self.slots])
+        self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
+        self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
+
+    def launch(self, kernel: wp.Kernel, inputs: list[Any], width: int = 1) -> None:
+        """Launch a kernel whose threads stride over the environments, ``width`` of them side by side in each.
+
+        On a GPU every environment has its own threads. The CPU has one core for all: its threads walk over every
+        environment, because starting one costs 40 ns, for the arguments are copied.
+        """
+        threads = 1 if self.device.is_cpu else self.num_envs
+        wp.launch(kernel, dim=(threads, width), inputs=[*inputs, threads], device=self.device)
 
     def _record(self) -> None:
         with wp.ScopedCapture(device=self.device) as capture:
