@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Render the README's picture without a screen or a GPU: ``python docs/render.py [docs/box_on_ground.png]``.
 
-64 copies of the paper's box are thrown across the ground in different directions; the picture shows them at 0.25 s, some
-stopped, some sliding. Needs the extras usd and rerun and a Vulkan driver (on Debian: mesa-vulkan-drivers).
+The paper's box at 0.35 s, sliding and turning. Needs the extras usd and rerun and a Vulkan driver (on Debian: mesa-vulkan-drivers).
 """
 
 import io
@@ -12,7 +11,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
 from PIL import Image
 from rerun.experimental import ViewerClient
 
@@ -21,22 +19,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # a clone that is 
 import warp_lcp as wl
 from warp_lcp.logger import free_port
 
-TIME = 0.25  # s
-ENVS = 64
+TIME = 0.35  # s
+ENVS = 1024
 
 
 def record(path: Path) -> None:
-    """Simulate and log the thrown boxes."""
+    """Simulate and log the run of the README's first command."""
     sim = wl.Simulator(wl.load_usd("box_on_ground"), ENVS, dt=1e-3, device="cpu")
-    rng = np.random.default_rng(1)
-    angle, speed = rng.uniform(0.0, 2.0 * np.pi, ENVS), rng.uniform(1.0, 3.0, ENVS)
-    velocity = sim.v.numpy().copy()
-    velocity[:, 0], velocity[:, 1], velocity[:, 5] = speed * np.cos(angle), speed * np.sin(angle), rng.uniform(-7.0, 7.0, ENVS)
-    sim.v.assign(velocity)
-    with wl.RerunLogger(sim, path, every=5) as logger:
+    with wl.RerunLogger(sim, path) as logger:
         logger.log()
-        for _ in range(round(2 * TIME / sim.dt / logger.every)):
-            sim.step(logger.every)
+        for _ in range(1000):
+            sim.step()
             logger.log()
 
 
