@@ -76,6 +76,30 @@ def test_recorded_steps_equal_eager_steps():
     assert (bits(recorded) == bits(eager)).all()
 
 
+def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
+    """What a GPU does differently, done on the CPU: environments fastest in memory, a thread for each, several workspaces."""
+    expected = {}
+    for method in ("auto", "lemke"):
+        sim = randomised(40, method=method)
+        sim.step(200)
+        expected[method] = bits(sim)
+
+    def array(self, n, dtype):
+        return wp.zeros((n, self.num_envs), dtype=dtype, device=self.device).transpose()
+
+    def launch(self, kernel, inputs, width=1):
+        wp.launch(kernel, dim=(self.num_envs, width), inputs=[*inputs, self.num_envs], device=self.device)
+
+    monkeypatch.setattr(wl.Simulator, "_array", array)
+    monkeypatch.setattr(wl.Simulator, "launch", launch)
+    monkeypatch.setattr("warp_lcp.methods.workspaces", lambda envs, scalars, device: 7)
+    for method in ("auto", "lemke"):
+        sim = randomised(40, method=method)
+        assert sim.q.strides[0] < sim.q.strides[1]
+        sim.step(200)
+        assert (bits(sim) == expected[method]).all()
+
+
 def test_a_nan_is_flagged_contained_and_healed_by_a_masked_reset():
     fresh = simulator(paper_box(), 8)
     fresh.step(50)

@@ -66,6 +66,16 @@ def test_pairs_are_decided_at_load():
     assert (model.nq, model.nv, model.dofs) == (21, 18, 12)
 
 
+def test_only_the_kernels_that_a_scene_needs():
+    """A box on a plane compiles no box against box, no sphere, and no solver for several bodies."""
+    from warp_lcp.simulator import kernel_names
+
+    names = kernel_names(paper_box())
+    assert "plane_box" in names
+    assert "pivot_single" in names
+    assert not {"box_box", "plane_sphere", "sphere_box", "sphere_sphere", "pivot", "pgs"} & set(names)
+
+
 def test_a_model_cannot_be_changed():
     model = paper_box()
     with pytest.raises(ValueError, match="read-only"):
