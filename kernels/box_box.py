@@ -183,11 +183,24 @@ def make(real):
             write(slots, env, slot + k, wp.transform_point(ref, local), normal, corners.z[k], feature)
         return corners.count
 
+    @wp.struct
+    class Crossing:
+        """Where an edge of a and an edge of b pass each other, in the frame of a."""
+
+        point: vec3
+        normal: vec3  # from a to b
+        gap: real
+        feature: int
+        between: bool  # do the nearest points of the two lines lie on both edges?
+        i: int  # axis of the edge of a, and its middle
+        edge_a: vec3
+        j: int
+        edge_b: vec3
+
     @wp.func
-    def edge_contact(slots: Slots, env: int, slot: int, xa: transform, ha: vec3, xb: transform, hb: vec3, rotation: mat33, i: int, j: int):
-        """One point between edge i of a and edge j of b."""
-        d = wp.transform_point(wp.transform_inverse(xa), wp.transform_get_translation(xb))
-        n = edge_axis(rotation, i, j)
+    def edge_crossing(d: vec3, rotation: mat33, ha: vec3, hb: vec3, i: int, j: int, axis: vec3) -> Crossing:
+        """The edges along i and j that lie furthest towards the other box, `axis` is their common normal."""
+        n = axis
         if wp.dot(n, d) < real(0.0):
             n = -n
         feature = 12 * 6 * 64 + (i * 3 + j) * 64
@@ -207,7 +220,6 @@ def make(real):
                     feature += 8 << k
                 else:
                     pb -= b_k * hb[k]
-        # Where the two lines pass each other.
         ea = vec3()
         ea[i] = real(1.0)
         eb = column(rotation, j)
@@ -215,10 +227,65 @@ def make(real):
         offset = pb - pa
         s = (wp.dot(offset, ea) - c * wp.dot(offset, eb)) / (real(1.0) - c * c)
         r = (c * wp.dot(offset, ea) - wp.dot(offset, eb)) / (real(1.0) - c * c)
+        result = Crossing()
+        result.between = wp.abs(s) <= ha[i] and wp.abs(r) <= hb[j]
         qa = pa + ea * wp.clamp(s, -ha[i], ha[i])
         qb = pb + eb * wp.clamp(r, -hb[j], hb[j])
-        point = wp.transform_point(xa, real(0.5) * (qa + qb))
-        write(slots, env, slot, point, wp.transform_vector(xa, n), wp.dot(n, offset), feature)
+        result.point = real(0.5) * (qa + qb)
+        result.normal = n
+        result.gap = wp.dot(n, offset)
+        result.feature = feature
+        result.i = i
+        result.edge_a = pa
+        result.j = j
+        result.edge_b = pb
+        return result
+
+    @wp.func
+    def edge_over_face(
+        slots: Slots,
+        env: int,
+        slot: int,
+        face: transform,
+        h: vec3,
+        c: vec3,
+        e: vec3,
+        half: real,
+        n: vec3,
+        near: vec3,
+        sign: real,
+        gap: real,
+    ) -> int:
+        """Where an edge that touches one side of a face leaves it again: an edge nearly parallel to a face lands on both.
+
+        In the frame of the box that owns the face: c + t e, |t| <= half, is the edge, n points to its owner, near is where
+        it crosses the side of the face. sign turns n into the normal from a to b. Returns the number of points, 0 or 1.
+        """
+        k = int(0)
+        for m in range(1, 3):
+            if wp.abs(n[m]) > wp.abs(n[k]):
+                k = m
+        side = wp.sign(n[k])
+        low = -half
+        high = half
+        for m in range(3):
+            if m != k and wp.abs(e[m]) > real(1.0e-9):
+                low = wp.max(low, wp.min((-h[m] - c[m]) / e[m], (h[m] - c[m]) / e[m]))
+                high = wp.min(high, wp.max((-h[m] - c[m]) / e[m], (h[m] - c[m]) / e[m]))
+        crossed = wp.dot(near - c, e)
+        t = high
+        if wp.abs(low - crossed) > wp.abs(high - crossed):
+            t = low
+        p = c + t * e
+        z = side * p[k] - h[k]
+        if low >= high or wp.abs(t - crossed) < real(0.01) * half or z < gap:
+            return 0
+        outward = vec3()
+        outward[k] = side
+        p[k] = side * (h[k] + real(0.5) * z)
+        feature = 13 * 6 * 64 + k * 2 + int(side > real(0.0))
+        write(slots, env, slot, wp.transform_point(face, p), sign * wp.transform_vector(face, outward), z, feature)
+        return 1
 
     @wp.kernel(module="unique", enable_backward=False)
     def box_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
@@ -264,13 +331,61 @@ def make(real):
                         if s > best_edge:
                             best_edge = s
                             axis = 6 + ij
+                crossing = Crossing()
                 if axis < 3:
                     count = face_contacts(slots, env, slot, xa, ha, xb, hb, axis, False)
                 elif axis < 6:
                     count = face_contacts(slots, env, slot, xb, hb, xa, ha, axis - 3, True)
                 else:
-                    edge_contact(slots, env, slot, xa, ha, xb, hb, rotation, (axis - 6) // 3, (axis - 6) % 3)
+                    i = (axis - 6) // 3
+                    j = (axis - 6) % 3
+                    crossing = edge_crossing(d, rotation, ha, hb, i, j, edge_axis(rotation, i, j))
+                    crossing.between = True
+                if count == 0 and axis < 6:
+                    # The faces look past each other: what will touch, if anything, are two edges.
+                    for ij in range(9):
+                        n = edge_axis(rotation, ij // 3, ij % 3)
+                        if wp.dot(n, n) > real(0.0):
+                            candidate = edge_crossing(d, rotation, ha, hb, ij // 3, ij % 3, n)
+                            if candidate.between and (not crossing.between or candidate.gap > crossing.gap):
+                                crossing = candidate
+                if crossing.between:
+                    normal = wp.transform_vector(xa, crossing.normal)
+                    write(slots, env, slot, wp.transform_point(xa, crossing.point), normal, crossing.gap, crossing.feature)
                     count = 1
+                    # The edge of b over a face of a, and that of a over a face of b.
+                    back = wp.transpose(rotation)
+                    n = crossing.normal
+                    near = crossing.point
+                    count += edge_over_face(
+                        slots,
+                        env,
+                        slot + count,
+                        xa,
+                        ha,
+                        crossing.edge_b,
+                        column(rotation, crossing.j),
+                        hb[crossing.j],
+                        n,
+                        near,
+                        real(1.0),
+                        crossing.gap,
+                    )
+                    c = back * (crossing.edge_a - d)
+                    count += edge_over_face(
+                        slots,
+                        env,
+                        slot + count,
+                        xb,
+                        hb,
+                        c,
+                        column(back, crossing.i),
+                        ha[crossing.i],
+                        -(back * n),
+                        back * (near - d),
+                        real(-1.0),
+                        crossing.gap,
+                    )
             for k in range(count, 8):
                 slots.gap[env, slot + k] = real(NO_POINT)
 
