@@ -113,20 +113,9 @@ def make(real):
     vec3, mat33, transform = t.vec3, t.mat33, t.transform
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f, a, p = pair_functions(real), axes(real), polygon(real)
-    shape_pose, write = f.shape_pose, f.write
+    shape_pose, reach, write = f.shape_pose, f.reach, f.write
     face_separation, edge_axis, edge_separation, column = a.face_separation, a.edge_axis, a.edge_separation, a.column
     Polygon, append, clip = p.Polygon, p.append, p.clip
-
-    @wp.func
-    def reach(topology: Topology, bodies: Bodies, env: int, shape: int, centre: vec3, h: real) -> real:
-        """Radius of the ball about a box's centre that it cannot leave within h."""
-        radius = wp.length(topology.shape_size[shape])
-        body = topology.shape_body[shape]
-        if body >= 0:
-            velocity = bodies.free_velocity[env, body]
-            lever = radius + wp.length(centre - bodies.com[env, body])
-            radius += real(2.0) * h * (wp.length(wp.spatial_top(velocity)) + wp.length(wp.spatial_bottom(velocity)) * lever)
-        return radius + real(0.01) * wp.length(topology.shape_size[shape])
 
     @wp.func
     def face_contacts(slots: Slots, env: int, slot: int, ref: transform, hr: vec3, inc: transform, hi: vec3, axis: int, flip: bool) -> int:
@@ -303,7 +292,10 @@ def make(real):
             slot = topology.pair_slots[pair]
             count = int(0)
 
-            if wp.length(cb - ca) < reach(topology, bodies, env, sa, ca, h) + reach(topology, bodies, env, sb, cb, h):
+            ra = wp.length(ha)
+            rb = wp.length(hb)
+            near = ra + reach(topology, bodies, env, sa, ca, ra, h) + rb + reach(topology, bodies, env, sb, cb, rb, h)
+            if wp.length(cb - ca) < near:
                 rotation = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(xa))) * wp.quat_to_matrix(wp.transform_get_rotation(xb))
                 d = wp.transform_point(wp.transform_inverse(xa), cb)
                 db = wp.transpose(rotation) * d

@@ -76,10 +76,12 @@ def make(real) -> SimpleNamespace:
     @wp.kernel(module="unique", enable_backward=False)
     def certify(
         bodies: Bodies,
+        h: real,
         tolerance: real,
         final: int,
         next_velocity: wp.array2d(dtype=spatial),
         contacts: Contacts,
+        slots: Slots,
         unsolved: wp.array(dtype=int),
         residual: wp.array(dtype=real),
         residual_energy: wp.array(dtype=real),
@@ -148,25 +150,21 @@ def make(real) -> SimpleNamespace:
             if final != 0 and finite and not solved:
                 status[env] = status[env] | UNCERTIFIED
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def remember(h: real, contacts: Contacts, slots: Slots, stride: int):
-        """History for the next step: which features touched, with what normal impulse and bristle force."""
-        start, _ = wp.tid()
-        for env in range(start, contacts.count.shape[0], stride):
-            for slot in range(slots.last_feature.shape[1]):
-                slots.last_feature[env, slot] = -1
-            for i in range(contacts.count[env]):
-                slot = contacts.slot[env, i]
-                p = contacts.impulse[env, i]
-                # An unloaded contact is remembered as such; one that never closed will be new when it does.
-                if p[0] > real(0.0) or contacts.closed[env, i] != 0:
-                    u = contacts.velocity[env, i]
-                    b_t = contacts.damping[env, i]
-                    frame = contacts.frame[env, i]
-                    bristle = vec3(real(0.0), p[1] / h + b_t * u[1], p[2] / h + b_t * u[2])
-                    slots.last_feature[env, slot] = slots.feature[env, slot]
-                    slots.last_impulse[env, slot] = p[0]
-                    slots.last_bristle[env, slot] = wp.transpose(frame) * bristle
+            if solved or final != 0:
+                # History for the next step: which features touched, with what normal impulse and bristle force (eq. 42).
+                for slot in range(slots.last_feature.shape[1]):
+                    slots.last_feature[env, slot] = -1
+                for i in range(r):
+                    p = contacts.impulse[env, i]
+                    # An unloaded contact is remembered as such; one that never closed will be new when it does.
+                    if p[0] > real(0.0) or contacts.closed[env, i] != 0:
+                        slot = contacts.slot[env, i]
+                        u = contacts.velocity[env, i]
+                        b_t = contacts.damping[env, i]
+                        bristle = vec3(real(0.0), p[1] / h + b_t * u[1], p[2] / h + b_t * u[2])
+                        slots.last_feature[env, slot] = slots.feature[env, slot]
+                        slots.last_impulse[env, slot] = p[0]
+                        slots.last_bristle[env, slot] = wp.transpose(contacts.frame[env, i]) * bristle
 
     @wp.kernel(module="unique", enable_backward=False)
     def integrate(
@@ -201,4 +199,4 @@ def make(real) -> SimpleNamespace:
             for k in range(6):
                 v[env, j + k] = velocity[k]
 
-    return SimpleNamespace(certify=certify, remember=remember, integrate=integrate)
+    return SimpleNamespace(certify=certify, integrate=integrate)

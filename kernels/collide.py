@@ -33,26 +33,37 @@ def pair_functions(real) -> SimpleNamespace:
         return pose
 
     @wp.func
+    def reach(topology: Topology, bodies: Bodies, env: int, shape: int, centre: vec3, radius: real, h: real) -> real:
+        """How far a point within `radius` of `centre` travels with a shape in 2 h, and a hundredth of the radius."""
+        travel = real(0.01) * radius + real(2.0) * h * wp.length(topology.surface_velocity[shape])
+        body = topology.shape_body[shape]
+        if body >= 0:
+            twist = bodies.free_velocity[env, body]
+            lever = radius + wp.length(centre - bodies.com[env, body])
+            travel += real(2.0) * h * (wp.length(wp.spatial_top(twist)) + wp.length(wp.spatial_bottom(twist)) * lever)
+        return travel
+
+    @wp.func
     def write(slots: Slots, env: int, slot: int, point: vec3, normal: vec3, gap: real, feature: int):
         slots.point[env, slot] = point
         slots.normal[env, slot] = normal
         slots.gap[env, slot] = gap
         slots.feature[env, slot] = feature
 
-    return SimpleNamespace(shape_pose=shape_pose, write=write)
+    return SimpleNamespace(shape_pose=shape_pose, reach=reach, write=write)
 
 
 @functools.cache
 def make(real) -> dict:
     """Kernels by the names of the two shape types; launch with dim (E, pairs of that kind).
 
-    ``first`` is the first pair of the kind; ``h`` is for kinds that look ahead (``box_box``).
+    ``first`` is the first pair of the kind; kinds that leave out far points look ahead by ``h``.
     """
     t = scalar_types(real)
     vec3 = t.vec3
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f = pair_functions(real)
-    shape_pose, write = f.shape_pose, f.write
+    shape_pose, reach, write = f.shape_pose, f.reach, f.write
 
     @wp.kernel(module="unique", enable_backward=False)
     def plane_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
@@ -77,6 +88,12 @@ def make(real) -> dict:
             size = topology.shape_size[topology.pairs[pair, 1]]
             normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
             origin = wp.transform_get_translation(plane)
+            centre = wp.transform_get_translation(box)
+            radius = wp.length(size)
+            # A corner further away than this gets no row; most have none, so they get no point either.
+            near = reach(topology, bodies, env, topology.pairs[pair, 0], centre, radius, h)
+            near += reach(topology, bodies, env, topology.pairs[pair, 1], centre, radius, h)
+            turn = wp.quat_to_matrix(wp.transform_get_rotation(box))
             slot = topology.pair_slots[pair]
             for k in range(8):
                 corner = size
@@ -86,9 +103,12 @@ def make(real) -> dict:
                     corner[1] = -size[1]
                 if (k & 4) == 0:
                     corner[2] = -size[2]
-                vertex = wp.transform_point(box, corner)
+                vertex = centre + turn * corner
                 gap = wp.dot(normal, vertex - origin)
-                write(slots, env, slot + k, vertex - normal * (real(0.5) * gap), normal, gap, k)
+                if gap < near:
+                    write(slots, env, slot + k, vertex - normal * (real(0.5) * gap), normal, gap, k)
+                else:
+                    slots.gap[env, slot + k] = real(NO_POINT)
 
     @wp.kernel(module="unique", enable_backward=False)
     def sphere_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):

@@ -274,8 +274,8 @@ class Simulator:
             method.launch(self)
             final = int(i + 1 == len(self._methods))
             answer = [self.unsolved, self.residual, self.residual_energy, self.status]
-            self.launch(k.certify, [self.bodies, self.tolerance, final, self.next_velocity, self.rows, *answer])
-        self.launch(k.remember, [h, self.rows, self.slots])
+            problem = [self.bodies, h, self.tolerance, final, self.next_velocity, self.rows, self.slots]
+            self.launch(k.certify, [*problem, *answer])
         self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
         self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
 
@@ -383,7 +383,6 @@ def stage_kernels(model: Model, real: Any) -> tuple[SimpleNamespace, list[tuple[
         select_contacts=rows.select_contacts,
         contact_rows=rows.contact_rows,
         certify=answer.certify,
-        remember=answer.remember,
         integrate=answer.integrate,
         reset=reset.make(real),
     )
