@@ -294,8 +294,8 @@ def make(real):
 
             ra = wp.length(ha)
             rb = wp.length(hb)
-            near = ra + reach(topology, bodies, env, sa, ca, ra, h) + rb + reach(topology, bodies, env, sb, cb, rb, h)
-            if wp.length(cb - ca) < near:
+            apart = ra + reach(topology, bodies, env, sa, ca, ra, h) + rb + reach(topology, bodies, env, sb, cb, rb, h)
+            if wp.length(cb - ca) < apart:
                 rotation = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(xa))) * wp.quat_to_matrix(wp.transform_get_rotation(xb))
                 d = wp.transform_point(wp.transform_inverse(xa), cb)
                 db = wp.transpose(rotation) * d
