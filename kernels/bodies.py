@@ -61,6 +61,9 @@ def make(real) -> SimpleNamespace:
                 pose[k] = q[env, i + k]
             for k in range(6):
                 velocity[k] = v[env, j + k]
+            # Users write q: a quaternion that is not of unit length would scale the body. Zero gives NaN, which is flagged.
+            turn = wp.transform_get_rotation(pose)
+            pose = transform(wp.transform_get_translation(pose), turn / wp.length(turn))
             bodies.pose[env, b] = pose
             bodies.velocity[env, b] = velocity
 

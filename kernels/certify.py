@@ -19,6 +19,9 @@ import warp as wp
 
 from .types import FIXED, NOT_A_NUMBER, OPEN, SLIDE, STICK, UNCERTIFIED, scalar_types
 
+# Residual of an answer that is not a number.
+HUGE = wp.constant(1.0e30)
+
 
 @functools.cache
 def law(real) -> SimpleNamespace:
@@ -73,16 +76,42 @@ def make(real) -> SimpleNamespace:
         """J (v+ - v_free) of one body."""
         return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
 
+    @wp.func
+    def law_error(relaxed: vec3, p: vec3, w: vec3, mu: vec2, k: int):
+        """Violation of the law by one contact [m/s] along n, t1, t2, and the inverse masses w = 1 / m that weigh it."""
+        if k > 2:  # the projection on a polygon needs one mass for both axes
+            w[1] = real(0.5) * (w[1] + w[2])
+            w[2] = w[1]
+        p_t = vec2(p[1], p[2])
+        target = project_friction(p_t - vec2(relaxed[1] / w[1], relaxed[2] / w[2]), p[0], mu, k)
+        error = vec3(wp.min(relaxed[0], p[0] * w[0]), (p_t[0] - target[0]) * w[1], (p_t[1] - target[1]) * w[2])
+        return error, w
+
+    @wp.func
+    def contact_state(p: vec3, mu: vec2, k: int) -> int:
+        """Open, stick or slide: it slides where a slightly larger friction impulse would not be admissible."""
+        state = OPEN
+        if p[0] > real(0.0):
+            state = STICK
+            pressed = vec2(p[1], p[2]) * (real(1.0) + real(1.0e-6))  # not real(1.0 + ...): literals add up in single precision
+            inside = project_friction(pressed, p[0], mu, k) - pressed
+            if k > 0 and wp.dot(inside, inside) > real(0.0):
+                state = SLIDE
+        return state
+
     @wp.kernel(module="unique", enable_backward=False)
     def certify(
         bodies: Bodies,
         h: real,
         tolerance: real,
+        attempt: int,
         final: int,
         next_velocity: wp.array2d(dtype=spatial),
         contacts: Contacts,
         slots: Slots,
         unsolved: wp.array(dtype=int),
+        reason: wp.array(dtype=int),
+        best_residual: wp.array(dtype=real),
         residual: wp.array(dtype=real),
         residual_energy: wp.array(dtype=real),
         status: wp.array(dtype=int),
@@ -93,62 +122,83 @@ def make(real) -> SimpleNamespace:
             if unsolved[env] == 0:
                 continue
             r = contacts.count[env]
-            for b in range(next_velocity.shape[1]):
-                next_velocity[env, b] = bodies.free_velocity[env, b]
-            for i in range(r):
-                impulse = wp.transpose(contacts.frame[env, i]) * contacts.impulse[env, i]
-                for side in range(2):
-                    b = contacts.body[env, i][side]
-                    if b >= 0:
-                        arm = contacts.point[env, i] - bodies.com[env, b]
-                        sign = real(2 * side - 1)
-                        next_velocity[env, b] += push(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * impulse)
-
             worst = real(0.0)
             energy = real(0.0)
             finite = bool(True)
-            for b in range(next_velocity.shape[1]):
-                finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
-            for i in range(r):
-                p = contacts.impulse[env, i]
-                eps = contacts.relaxation[env, i]
-                d = contacts.shift[env, i]
-                du = vec3()
-                for side in range(2):
-                    b = contacts.body[env, i][side]
-                    if b >= 0:
-                        arm = contacts.point[env, i] - bodies.com[env, b]
-                        du += real(2 * side - 1) * change(next_velocity[env, b] - bodies.free_velocity[env, b], arm)
-                relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
-                w = contacts.inv_mass[env, i] + eps  # 1 / m
-                k = contacts.directions[env, i]
-                if k > 2:  # the projection on a polygon needs one mass for both axes
-                    w[1] = real(0.5) * (w[1] + w[2])
-                    w[2] = w[1]
-                p_t = vec2(p[1], p[2])
-                target = project_friction(p_t - vec2(relaxed[1] / w[1], relaxed[2] / w[2]), p[0], contacts.mu[env, i], k)
-                error = vec3(wp.min(relaxed[0], p[0] * w[0]), (p_t[0] - target[0]) * w[1], (p_t[1] - target[1]) * w[2])
-                worst = wp.max(worst, wp.max(wp.abs(error)))
-                energy += real(0.5) * wp.dot(wp.cw_div(error, w), error)
-                contacts.velocity[env, i] = relaxed - wp.cw_mul(eps, p) - d
-                state = OPEN
-                if p[0] > real(0.0):
-                    state = STICK
-                    pressed = p_t * (real(1.0) + real(1.0e-6))  # not real(1.0 + ...): literals add up in single precision
-                    inside = project_friction(pressed, p[0], contacts.mu[env, i], k) - pressed
-                    if k > 0 and wp.dot(inside, inside) > real(0.0):
-                        state = SLIDE
-                contacts.state[env, i] = state
+            judging = bool(True)
+            restored = bool(False)
+            while judging:
+                judging = False
+                for b in range(next_velocity.shape[1]):
+                    next_velocity[env, b] = bodies.free_velocity[env, b]
+                for i in range(r):
+                    impulse = wp.transpose(contacts.frame[env, i]) * contacts.impulse[env, i]
+                    for side in range(2):
+                        b = contacts.body[env, i][side]
+                        if b >= 0:
+                            arm = contacts.point[env, i] - bodies.com[env, b]
+                            sign = real(2 * side - 1)
+                            next_velocity[env, b] += push(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * impulse)
+
+                worst = real(0.0)
+                energy = real(0.0)
+                finite = bool(True)
+                for b in range(next_velocity.shape[1]):
+                    finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
+                for i in range(r):
+                    p = contacts.impulse[env, i]
+                    eps = contacts.relaxation[env, i]
+                    du = vec3()
+                    for side in range(2):
+                        b = contacts.body[env, i][side]
+                        if b >= 0:
+                            arm = contacts.point[env, i] - bodies.com[env, b]
+                            du += real(2 * side - 1) * change(next_velocity[env, b] - bodies.free_velocity[env, b], arm)
+                    relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
+                    k = contacts.directions[env, i]
+                    mu = contacts.mu[env, i]
+                    error, w = law_error(relaxed, p, contacts.inv_mass[env, i] + eps, mu, k)
+                    worst = wp.max(worst, wp.max(wp.abs(error)))
+                    energy += real(0.5) * wp.dot(wp.cw_div(error, w), error)
+                    contacts.velocity[env, i] = relaxed - wp.cw_mul(eps, p) - contacts.shift[env, i]
+                    contacts.state[env, i] = contact_state(p, mu, k)
+                if not finite:
+                    worst = real(HUGE)
+
+                # Of several uncertified answers the best one is applied; the first of them is no impulse at all.
+                if worst > tolerance and not restored:
+                    if attempt == 0:
+                        best_residual[env] = real(0.0)
+                        for i in range(r):
+                            free, w = law_error(
+                                contacts.free[env, i],
+                                vec3(),
+                                contacts.inv_mass[env, i] + contacts.relaxation[env, i],
+                                contacts.mu[env, i],
+                                contacts.directions[env, i],
+                            )
+                            best_residual[env] = wp.max(best_residual[env], wp.max(wp.abs(free)))
+                            contacts.best_impulse[env, i] = vec3()
+                    if worst < best_residual[env]:
+                        best_residual[env] = worst
+                        for i in range(r):
+                            contacts.best_impulse[env, i] = contacts.impulse[env, i]
+                    if final != 0 and worst > best_residual[env] and r > 0:
+                        for i in range(r):
+                            contacts.impulse[env, i] = contacts.best_impulse[env, i]
+                        judging = True
+                        restored = True
 
             residual[env] = worst
             residual_energy[env] = energy
-            solved = finite and worst <= tolerance
-            if not finite:
-                status[env] = status[env] | NOT_A_NUMBER
+            solved = worst <= tolerance
             if solved:
                 unsolved[env] = 0
-            if final != 0 and finite and not solved:
-                status[env] = status[env] | UNCERTIFIED
+            elif final != 0:
+                if finite:
+                    status[env] = status[env] | reason[env] | UNCERTIFIED
+                else:
+                    status[env] = status[env] | NOT_A_NUMBER
 
             if solved or final != 0:
                 # History for the next step: which features touched, with what normal impulse and bristle force (eq. 42).

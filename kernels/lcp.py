@@ -16,7 +16,7 @@ import warp as wp
 
 from . import lemke as lemke_file
 from . import linear
-from .types import LANES, scalar_types, sync
+from .types import ITERATION_LIMIT, LANES, scalar_types, sync
 
 
 @functools.cache
@@ -235,17 +235,20 @@ def make(real):
         lcp: LcpWorkspace,
         ws: ContactWorkspace,
         iterations: wp.array(dtype=int),
-        status: wp.array(dtype=int),
+        reason: wp.array(dtype=int),
     ):
         slot, lane = wp.tid()
         for env in range(slot, contacts.count.shape[0], lcp.q.shape[0]):
-            if unsolved[env] != 0 and contacts.count[env] > 0:
+            if contacts.count[env] > ws.friction.shape[1] - 1:  # more contacts than the workspace was made for
+                if lane == 0 and unsolved[env] != 0:
+                    reason[env] = reason[env] | ITERATION_LIMIT
+            elif unsolved[env] != 0 and contacts.count[env] > 0:
                 n = assemble(lcp, ws, bodies, contacts, env, slot, rho_scale, lane)
                 result = lemke(lcp, slot, n, 10 * n + 100, lane)
                 impulses(lcp, ws, contacts, env, slot, lane)
                 if lane == 0:
                     iterations[env] = iterations[env] + result[1]
-                    status[env] = status[env] | result[0]
+                    reason[env] = reason[env] | result[0]
                 sync()
 
     return lemke_contacts

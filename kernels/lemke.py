@@ -229,6 +229,10 @@ def functions(real) -> SimpleNamespace:
         if status != 0:
             read_tableau(ws, slot, n, lane)
         elif not solve_basis(ws, slot, n, lane):
+            # A singular basis: its tableau is gone, and what stands in z belongs to another problem.
+            for i in range(lane, n, wp.block_dim()):
+                ws.z[slot, i] = real(0.0)
+            sync()
             status = RAY
         return wp.vec2i(status, pivots)
 

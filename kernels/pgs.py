@@ -54,18 +54,23 @@ def make(real):
     def pgs(
         bodies: Bodies,
         contacts: Contacts,
+        unsolved: wp.array(dtype=int),
         sweeps: int,
         tolerance: real,
         velocity: wp.array2d(dtype=spatial),
         iterations: wp.array(dtype=int),
-        status: wp.array(dtype=int),
+        reason: wp.array(dtype=int),
         stride: int,
     ):
         start, _ = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
+            if unsolved[env] == 0:
+                continue
             r = contacts.count[env]
             for b in range(velocity.shape[1]):
                 velocity[env, b] = bodies.free_velocity[env, b]
+            for i in range(r):
+                contacts.impulse[env, i] = vec3()
             change = real(0.0)
             sweep = int(0)
             searching = r > 0
@@ -97,6 +102,6 @@ def make(real):
                 searching = change > tolerance and sweep < sweeps
             iterations[env] = iterations[env] + sweep
             if change > tolerance:
-                status[env] = status[env] | ITERATION_LIMIT
+                reason[env] = reason[env] | ITERATION_LIMIT
 
     return pgs

@@ -228,11 +228,10 @@ def make_single(real):
                     k = contacts.directions[env, i]
                     state = contacts.state[env, i]
                     after = next_state(relaxed, eps, contacts.inv_mass[env, i][0], mu, k, state, tolerance)
+                    contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, k, state)
                     if after != state:
                         flips += 1
                         contacts.state[env, i] = after
-                    else:
-                        contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, k, state)
             iterations[env] = iterations[env] + solves
 
     return pivot_single
@@ -360,11 +359,10 @@ def make(real) -> SimpleNamespace:
             k = contacts.directions[env, i]
             state = contacts.state[env, i]
             after = next_state(relaxed, eps, contacts.inv_mass[env, i][0], mu, k, state, tolerance)
+            contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, k, state)
             if after != state:
                 wp.atomic_add(ws.flips, slot, 1)
                 contacts.state[env, i] = after
-            else:
-                contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, k, state)
         sync()
         return ws.flips[slot]
 

@@ -110,6 +110,7 @@ def scalar_types(real) -> SimpleNamespace:
         directions: wp.array2d(dtype=int)  # [E, R] k; 0 = no friction rows
         damping: wp.array2d(dtype=real)  # [E, R] b_t, N s/m
         impulse: wp.array2d(dtype=vec3)  # [E, R] h lambda in the contact frame, N s
+        best_impulse: wp.array2d(dtype=vec3)  # [E, R] likewise, of the best uncertified answer so far
         velocity: wp.array2d(dtype=vec3)  # [E, R] u+ in the contact frame, m/s
         state: wp.array2d(dtype=int)  # [E, R] open, stick, slide
 

@@ -175,7 +175,11 @@ def test_parameters_reject_what_no_body_can_have():
         ({"mass": [0.0]}, r"mass\[0, 0\] is 0.0; it must be finite and greater than zero"),
         ({"mass": [[1.0], [np.nan]]}, r"mass\[1, 0\] is nan"),
         ({"friction": np.full((2, 2), -0.1)}, "it must be finite and not negative"),
+        ({"friction": [[0.3, 0.9]] * 2}, "mu_k no larger than mu_s"),
+        ({"contact": np.zeros((2, 5))}, "greater than zero"),
         ({"inertia": -np.eye(3)[None]}, "positive definite"),
+        ({"inertia": [np.diag([1.0, 1.0, 3.0])]}, "no moment may exceed"),
+        ({"inertia": [[[1, 0.9, 0], [0, 1, 0], [0, 0, 1]]]}, "must be symmetric"),
         ({"gravity": [0, 0]}, r"gravity has shape \(2,\); give \(3,\) or \(2, 3\)"),
         ({"weight": [1.0]}, "'weight' is not a parameter; choose from mass"),
     ]:
@@ -209,18 +213,39 @@ def test_strict_raises_and_names_the_environment():
 
 
 def test_overflow_is_flagged_not_silent():
-    """A block between many planes has more points than 24 a body; the environment says so."""
+    """A block on nine planes at one place has 72 points, more than the 64 there is room for; the environment says so."""
     builder = wl.ModelBuilder()
-    for _ in range(8):
+    for _ in range(9):
         builder.add_plane()
     body = builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1))
-    builder.add_box(body, (0.1, 0.1, 0.1))
+    builder.add_box(body, (0.1, 0.1, 0.1), pose=(0, 0, 0, 0, 0, 0, 1))
     model = builder.finalize()
-    assert (model.num_slots, model.max_contacts) == (64, 24)
-    sim = simulator(model)
+    assert (model.num_slots, model.max_contacts) == (72, 64)
+    sim = simulator(model, dt=0.5)  # a step so long that all corners are within reach
     sim.step()
     assert sim.status.numpy()[0] & wl.Status.OVERFLOW
-    assert sim.contacts.count.numpy()[0] == 24
+    assert sim.contacts.count.numpy()[0] == 64
+
+
+def test_a_plank_on_seven_supports_has_room():
+    builder = wl.ModelBuilder()
+    for i in range(7):
+        builder.add_box(-1, (0.1, 0.5, 0.1), pose=(0.2 * i, 0, -0.1, 0, 0, 0, 1))
+    body = builder.add_body(pose=(0.6, 0, 0.1, 0, 0, 0, 1))
+    builder.add_box(body, (0.63, 0.1, 0.1))
+    sim = simulator(builder, strict=True)
+    sim.step(200)
+    assert sim.q.numpy()[0, 2] == pytest.approx(0.1, abs=1e-9)
+
+
+def test_scenes_without_contacts_or_movable_bodies():
+    """A free body alone, and a kinematic body alone: they follow their velocity."""
+    for joint, fall in ((wl.JointType.FREE, G * 0.01 * 0.011 / 2), (wl.JointType.KINEMATIC, 0.0)):
+        builder = wl.ModelBuilder()
+        builder.add_body(joint=joint, velocity=(1, 0, 0), mass=1.0, inertia=np.eye(3))
+        sim = simulator(builder, strict=True)
+        sim.step(10)
+        assert sim.q.numpy()[0, :3] == pytest.approx([0.01, 0, -fall], abs=1e-12)
 
 
 @pytest.mark.parametrize(

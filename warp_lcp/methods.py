@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 GPU_WORKSPACES = 2048
 #: ... but no more than this many bytes in all.
 GPU_WORKSPACE_BYTES = 2**28
+#: Largest LCP that Lemke's method takes: its tableau grows with the square. Larger problems are left to other methods.
+LCP_UNKNOWNS = 2000
 
 
 def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
@@ -41,7 +43,7 @@ def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
 
 def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
     """Problems of so many scalars worked on at one time: one on the CPU, where it stays in the cache."""
-    return 1 if device.is_cpu else max(1, min(num_envs, GPU_WORKSPACES, GPU_WORKSPACE_BYTES // (8 * scalars)))
+    return 1 if device.is_cpu else max(1, min(num_envs, GPU_WORKSPACES, GPU_WORKSPACE_BYTES // (8 * max(scalars, 1))))
 
 
 class Lemke:
@@ -51,7 +53,8 @@ class Lemke:
         self.kernel = lcp.make(real)
 
     def prepare(self, sim: Simulator) -> None:
-        r, real = sim.model.max_contacts, sim.real
+        real = sim.real
+        r = min(sim.model.max_contacts, LCP_UNKNOWNS // (1 + 2 * sim.directions))
         n = r * (1 + 2 * sim.directions)
         slots = workspaces(sim.num_envs, 2 * n * n + 15 * r * r, sim.device)
         self.lcp = lcp_workspace(real, slots, n, sim.device)
@@ -65,7 +68,7 @@ class Lemke:
         self.slots = slots
 
     def launch(self, sim: Simulator) -> None:
-        inputs = [sim.bodies, sim.rows, sim.unsolved, sim.rho_scale, self.lcp, self.contacts, sim.iterations, sim.status]
+        inputs = [sim.bodies, sim.rows, sim.unsolved, sim.rho_scale, self.lcp, self.contacts, sim.iterations, sim.reason]
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
@@ -115,13 +118,14 @@ class BlockPGS:
         # Sweeps end where no impulse changes a velocity by more than a hundredth of what certifies an answer.
         sim.launch(
             self.kernel,
-            [sim.bodies, sim.rows, self.SWEEPS, 0.01 * sim.tolerance, sim.next_velocity, sim.iterations, sim.status],
+            [sim.bodies, sim.rows, sim.unsolved, self.SWEEPS, 0.01 * sim.tolerance, sim.next_velocity, sim.iterations, sim.reason],
         )
 
 
-#: Methods by the name that users give; each is tried on the environments that those before it left unsolved.
+#: Methods by the name that users give; each is tried on the environments that those before it left unsolved. Where none
+#: certifies its answer, the best is applied.
 METHODS: dict[str, tuple[type, ...]] = {
-    "auto": (VelocityPivoting, Lemke),
+    "auto": (VelocityPivoting, Lemke, BlockPGS),
     "lemke": (Lemke,),
     "velocity_pivoting": (VelocityPivoting,),
     "pgs": (BlockPGS,),

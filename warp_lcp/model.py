@@ -203,7 +203,7 @@ class Model:
     def max_contacts(self) -> int:
         """Contacts that may act at one time in one environment.
 
-        All slots, but no more than 24 per movable body: a rigid body held by more points than that at one time is a
-        degenerate scene, and pairs grow with the square of the bodies. What does not fit is dropped and flagged.
+        All slots while there are at most 64, else 24 per movable body if that is more: slots grow with the square of the
+        bodies, points that touch at one time do not. What does not fit is dropped and flagged.
         """
-        return min(self.num_slots, 24 * (self.dofs // 6))
+        return min(self.num_slots, max(64, 24 * (self.dofs // 6)))

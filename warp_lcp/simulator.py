@@ -22,10 +22,10 @@ PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.fl
 #: Parameters that may differ between environments, and what their numbers must be.
 PARAMETERS = {
     "mass": "it must be finite and greater than zero",
-    "inertia": "it must be finite and positive definite",
+    "inertia": "it must be symmetric and positive definite, and no moment may exceed the sum of the others",
     "com": "it must be finite",
-    "friction": "it must be finite and not negative",
-    "contact": "it must be finite and not negative, or NaN for Table 1",
+    "friction": "it must be finite and not negative, and mu_k no larger than mu_s",
+    "contact": "it must be finite and not negative (damping and slip threshold greater than zero), or NaN for Table 1",
     "gravity": "it must be finite",
 }
 #: Largest residual [m/s] of an answer that counts as solved.
@@ -79,7 +79,7 @@ class Simulator:
         dt: step size h [s].
         formulation: contact law, see docs/theory.md.
         method: how the contact problem is solved: 'lemke', 'velocity_pivoting', 'pgs', or 'auto': velocity pivoting, then
-            Lemke's method for the environments that it left unsolved (in float32: pgs).
+            Lemke's method, then pgs for the environments that are not solved by then (in float32: pgs alone).
         sliding: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes throughout).
         directions: k, friction directions of a sticking contact, at least 2.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
@@ -148,7 +148,9 @@ class Simulator:
     # ---------------------------------------------------------------------------------------------------- stepping
 
     def step(self, count: int = 1) -> None:
-        """Advance every environment by ``count`` steps."""
+        """Advance every environment by ``count`` steps (0 only prepares)."""
+        if int(count) != count or count < 0:
+            raise WarpLcpError(f"step: count is {count}; give a whole number of at least 0")
         if self._graph is None:
             self._record()
         self.status.zero_()
@@ -218,10 +220,17 @@ class Simulator:
         allowed: np.ndarray = np.isfinite(array) | (np.isnan(array) & (name == "contact"))
         if name == "mass":
             allowed &= array > 0.0
-        elif name in ("friction", "contact"):
+        elif name == "friction":
+            allowed &= array >= 0.0
+            allowed[..., 1] &= array[..., 1] <= array[..., 0]
+        elif name == "contact":
             allowed &= ~(array < 0.0)
+            allowed[..., [1, 3, 4]] &= array[..., [1, 3, 4]] != 0.0
         elif name == "inertia" and allowed.all():
-            allowed &= np.linalg.eigvalsh(array).min(axis=-1)[..., None, None] > 0.0
+            moments = np.linalg.eigvalsh(array)
+            possible = (moments[..., 0] > 0.0) & (moments[..., 2] <= (moments[..., 0] + moments[..., 1]) * (1 + 1e-6))
+            possible &= np.isclose(array, np.swapaxes(array, -1, -2), rtol=1e-6, atol=0.0).all(axis=(-1, -2))
+            allowed &= possible[..., None, None]
         if not allowed.all():
             where = tuple(int(i) for i in np.argwhere(~allowed)[0])
             raise WarpLcpError(f"set_parameters: {name}{list(where)} is {array[where]}; {PARAMETERS[name]}")
@@ -266,6 +275,7 @@ class Simulator:
         for kernel, first, number in self._pair_kernels:
             self.launch(kernel, [self.topology, self.bodies, first, h, self.slots], number)
         self.unsolved.fill_(1)
+        self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
         sliding = SLIDING.index(self.sliding)
         rows = [*scene, self.bodies, self.slots, h, sliding, self.directions, self.rows]
@@ -273,8 +283,8 @@ class Simulator:
         for i, method in enumerate(self._methods):
             method.launch(self)
             final = int(i + 1 == len(self._methods))
-            answer = [self.unsolved, self.residual, self.residual_energy, self.status]
-            problem = [self.bodies, h, self.tolerance, final, self.next_velocity, self.rows, self.slots]
+            answer = [self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, self.status]
+            problem = [self.bodies, h, self.tolerance, i, final, self.next_velocity, self.rows, self.slots]
             self.launch(k.certify, [*problem, *answer])
         self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
         self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
@@ -346,8 +356,8 @@ class Simulator:
         rows.count = wp.zeros(e, dtype=int, device=self.device)
         rows.body = self._array(r, wp.vec2i)
         rows.slot, rows.closed, rows.state, rows.directions = (self._array(r, int) for _ in range(4))
-        rows.point, rows.inv_mass, rows.relaxation, rows.shift, rows.free, rows.impulse, rows.velocity = (
-            self._array(r, t.vec3) for _ in range(7)
+        rows.point, rows.inv_mass, rows.relaxation, rows.shift, rows.free, rows.impulse, rows.velocity, rows.best_impulse = (
+            self._array(r, t.vec3) for _ in range(8)
         )
         rows.gap, rows.damping = self._array(r, self.real), self._array(r, self.real)
         rows.frame, rows.mu = self._array(r, t.mat33), self._array(r, t.vec2)
@@ -357,8 +367,8 @@ class Simulator:
         for array, values in ((self.q, m.q0), (self.q0, m.q0), (self.v, m.v0), (self.v0, m.v0)):
             array.assign(np.tile(values.astype(self._numpy_real), (e, 1)))
         self.wrench = self._array(b, t.spatial)
-        self.status, self.iterations, self.unsolved = (wp.zeros(e, dtype=int, device=self.device) for _ in range(3))
-        self.residual, self.residual_energy = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(2))
+        self.status, self.iterations, self.unsolved, self.reason = (wp.zeros(e, dtype=int, device=self.device) for _ in range(4))
+        self.residual, self.residual_energy, self.best_residual = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(3))
 
     def _load_kernels(self) -> None:
         self._kernels, self._pair_kernels = stage_kernels(self.model, self.real)
