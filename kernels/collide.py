@@ -44,13 +44,31 @@ def pair_functions(real) -> SimpleNamespace:
         return travel
 
     @wp.func
-    def write(slots: Slots, env: int, slot: int, point: vec3, normal: vec3, gap: real, feature: int):
+    def shape_velocity(
+        topology: Topology, bodies: Bodies, velocity: wp.array2d(dtype=t.spatial), env: int, shape: int, point: vec3
+    ) -> vec3:
+        """Velocity of a point of a shape for given velocities of the bodies, world axes."""
+        u = vec3()
+        body = topology.shape_body[shape]
+        if body >= 0:
+            twist = velocity[env, body]
+            u = wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), point - bodies.com[env, body])
+        return u
+
+    @wp.func
+    def write_bent(slots: Slots, env: int, slot: int, point: vec3, normal: vec3, gap: real, bend: real, feature: int):
         slots.point[env, slot] = point
         slots.normal[env, slot] = normal
         slots.gap[env, slot] = gap
+        slots.bend[env, slot] = bend
         slots.feature[env, slot] = feature
 
-    return SimpleNamespace(shape_pose=shape_pose, reach=reach, write=write)
+    @wp.func
+    def write(slots: Slots, env: int, slot: int, point: vec3, normal: vec3, gap: real, feature: int):
+        """A point between flat features: its gap changes by h u_n."""
+        write_bent(slots, env, slot, point, normal, gap, real(0.0), feature)
+
+    return SimpleNamespace(shape_pose=shape_pose, reach=reach, shape_velocity=shape_velocity, write=write, write_bent=write_bent)
 
 
 @functools.cache
@@ -63,7 +81,7 @@ def make(real) -> dict:
     vec3 = t.vec3
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f = pair_functions(real)
-    shape_pose, reach, write = f.shape_pose, f.reach, f.write
+    shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
 
     @wp.kernel(module="unique", enable_backward=False)
     def plane_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
@@ -125,7 +143,20 @@ def make(real) -> dict:
             if distance > real(0.0):
                 normal = offset / distance
             gap = distance - ra - rb
-            write(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, 0)
+            u = shape_velocity(topology, bodies, bodies.free_velocity, env, topology.pairs[pair, 1], b)
+            u -= shape_velocity(topology, bodies, bodies.free_velocity, env, topology.pairs[pair, 0], a)
+            # The gap of curved surfaces that pass each other closes less than the tangent plane says.
+            bend = wp.length(offset + h * u) - distance - h * wp.dot(normal, u)
+            write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, bend, 0)
+
+    @wp.func
+    def box_distance(p: vec3, size: vec3) -> real:
+        """Distance of a point from a box in the box's frame; inside: minus the depth under the nearest face."""
+        outside = vec3(
+            wp.max(wp.abs(p[0]) - size[0], real(0.0)), wp.max(wp.abs(p[1]) - size[1], real(0.0)), wp.max(wp.abs(p[2]) - size[2], real(0.0))
+        )
+        depth = wp.max(wp.max(wp.abs(p[0]) - size[0], wp.abs(p[1]) - size[1]), wp.abs(p[2]) - size[2])
+        return wp.length(outside) + wp.min(depth, real(0.0))
 
     @wp.kernel(module="unique", enable_backward=False)
     def sphere_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
@@ -165,7 +196,14 @@ def make(real) -> dict:
             normal = wp.transform_vector(box, inward)
             gap = distance - radius
             point = wp.transform_point(box, nearest) - normal * (real(0.5) * gap)
-            write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
+            # A sphere that rolls towards an edge it will just touch closes less of the gap than the tangent plane says.
+            u = shape_velocity(topology, bodies, bodies.free_velocity, env, topology.pairs[pair, 0], centre)
+            u -= shape_velocity(topology, bodies, bodies.free_velocity, env, topology.pairs[pair, 1], centre)
+            bend = real(0.0)
+            if gap > real(0.0):
+                ahead = local + h * wp.quat_rotate_inv(wp.transform_get_rotation(box), u)
+                bend = wp.max(box_distance(ahead, size) - distance + h * wp.dot(normal, u), real(0.0))
+            write_bent(slots, env, topology.pair_slots[pair], point, normal, gap, bend, 0)
 
     return {
         ("PLANE", "SPHERE"): plane_sphere,

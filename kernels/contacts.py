@@ -105,6 +105,7 @@ def row_functions(real) -> SimpleNamespace:
         mobility: mat33,
         n: vec3,
         phi: real,
+        bend: real,
         u: vec3,
         u_free: vec3,
         c: vec5,
@@ -141,7 +142,7 @@ def row_functions(real) -> SimpleNamespace:
         # loaded ones beside it, which is what makes redundant normal forces unique.
         eps_n = real(1.0) / (k_n * h * h + b_n * h)
         closed = phi <= real(0.0) or (history.touched and phi * k_n * h <= real(ELASTIC_RANGE) * weight)
-        d_n = phi / h
+        d_n = (phi + bend) / h
         if closed:
             d_n = wp.max(eps_n * h * k_n * phi, -real(MAX_DEPENETRATION_SPEED))
 
@@ -310,7 +311,9 @@ def make(real) -> SimpleNamespace:
             history.bristle = slots.last_bristle[env, slot]
             u = contacts.velocity[env, i]
             u_free = contacts.free[env, i]
-            row = make_row(mobility, slots.normal[env, slot], phi, u, u_free, c, mu, history, g, h, sliding, directions)
+            row = make_row(
+                mobility, slots.normal[env, slot], phi, slots.bend[env, slot], u, u_free, c, mu, history, g, h, sliding, directions
+            )
 
             contacts.body[env, i] = body
             contacts.point[env, i] = point

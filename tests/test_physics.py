@@ -252,6 +252,43 @@ def test_corner_on_an_edge_comes_to_rest():
     assert on_floor.any()
 
 
+def tiles(builder: wl.ModelBuilder, material: wl.Material) -> None:
+    """A floor of twenty tiles along x, flush, top at z = 0."""
+    for i in range(20):
+        builder.add_box(-1, (0.1, 1, 0.1), pose=(-0.9 + 0.2 * i, 0, -0.1, 0, 0, 0, 1), material=material)
+
+
+@pytest.mark.parametrize("h", [1e-3, 5e-3, 1e-2])
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_a_box_slides_over_seams_as_over_a_plane(h, turn):
+    """v0 - mu g t to 1e-6 and no hop (10 nm): the side of the next tile is no obstacle. 1e-6 is bristle round-off."""
+    builder, material = wl.ModelBuilder(), wl.Material(0.1, 0.1)
+    tiles(builder, material)
+    body = builder.add_body(pose=(-0.5, 0, 0.05, 0, 0, np.sin(turn / 2), np.cos(turn / 2)), velocity=(4, 0, 0))
+    builder.add_box(body, (0.05, 0.05, 0.05), material=material)
+    sim = simulator(builder, dt=h)
+    for _ in range(round(0.4 / h)):
+        sim.step()
+        assert sim.status.numpy()[0] == 0
+        assert sim.q.numpy()[0, 2] - 0.05 < 1e-8
+    assert sim.v.numpy()[0, 0] == pytest.approx(4 - 0.1 * G * 0.4, rel=1e-6)
+
+
+@pytest.mark.parametrize(("h", "loss", "hop"), [(1e-3, 1e-3, 1e-7), (5e-3, 2e-2, 1e-5), (1e-2, 8e-2, 1e-4)])
+def test_a_sphere_rolls_over_seams(h, loss, hop):
+    """Ten seams at 2.1 m/s. Exact: no loss. The edge of the next tile is felt a step ahead with gravity's share of the step,
+    a loss that falls with h^2; without the curvature of the gap it was 0.3, 6 and 21 %, with hops of 3 mm."""
+    builder, material = wl.ModelBuilder(), wl.Material(0.5, 0.5)
+    tiles(builder, material)
+    body = builder.add_body(pose=(-0.5, 0, 0.1, 0, 0, 0, 1), velocity=(2.1, 0, 0), angular_velocity=(0, 21, 0))
+    builder.add_sphere(body, 0.1, material=material)
+    sim = simulator(builder, dt=h)
+    for _ in range(round(1.0 / h)):
+        sim.step()
+        assert sim.q.numpy()[0, 2] - 0.1 < hop
+    assert 1 - sim.v.numpy()[0, 0] / 2.1 < loss
+
+
 def test_tumbling_boxes_lose_energy_and_come_to_rest():
     """Boxes thrown at random never gain mechanical energy (1e-6 m of height) and lie still in the end."""
     envs, half = 64, np.array([0.2, 0.15, 0.1])

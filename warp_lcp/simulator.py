@@ -347,7 +347,7 @@ class Simulator:
 
         slots = self.slots = t.Slots()
         slots.point, slots.normal = self._array(c, t.vec3), self._array(c, t.vec3)
-        slots.gap, slots.feature = self._array(c, self.real), self._array(c, int)
+        slots.gap, slots.bend, slots.feature = self._array(c, self.real), self._array(c, self.real), self._array(c, int)
         slots.last_feature, slots.last_impulse = self._array(c, int), self._array(c, self.real)
         slots.last_bristle = self._array(c, t.vec3)
         slots.last_feature.fill_(-1)
