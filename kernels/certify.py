@@ -17,6 +17,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from . import rigid
 from .types import FIXED, NOT_A_NUMBER, OPEN, SLIDE, STICK, UNCERTIFIED, scalar_types
 
 # Residual of an answer that is not a number.
@@ -60,21 +61,11 @@ def law(real) -> SimpleNamespace:
 def make(real) -> SimpleNamespace:
     """Kernels ``certify`` (dim E) and ``integrate`` (dim E, B)."""
     t = scalar_types(real)
-    vec2, vec3, mat33, transform, spatial = t.vec2, t.vec3, t.mat33, t.transform, t.spatial
+    vec2, vec3, transform, spatial = t.vec2, t.vec3, t.transform, t.spatial
     Bodies, Contacts, Slots, Topology = t.Bodies, t.Contacts, t.Slots, t.Topology
     project_friction = law(real).project_friction
-
-    @wp.func
-    def push(inv_mass: real, inv_inertia: mat33, arm: vec3, impulse: vec3) -> spatial:
-        """M^-1 J^T p of one impulse (world axes) on one body."""
-        dv = inv_mass * impulse
-        dw = inv_inertia * wp.cross(arm, impulse)
-        return spatial(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
-
-    @wp.func
-    def change(twist: spatial, arm: vec3) -> vec3:
-        """J (v+ - v_free) of one body."""
-        return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
+    body = rigid.functions(real)
+    point_velocity, impulse_response = body.point_velocity, body.impulse_response
 
     @wp.func
     def law_error(relaxed: vec3, p: vec3, w: vec3, mu: vec2, k: int):
@@ -138,7 +129,9 @@ def make(real) -> SimpleNamespace:
                         if b >= 0:
                             arm = contacts.point[env, i] - bodies.com[env, b]
                             sign = real(2 * side - 1)
-                            next_velocity[env, b] += push(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * impulse)
+                            next_velocity[env, b] += impulse_response(
+                                bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * impulse
+                            )
 
                 worst = real(0.0)
                 energy = real(0.0)
@@ -153,7 +146,7 @@ def make(real) -> SimpleNamespace:
                         b = contacts.body[env, i][side]
                         if b >= 0:
                             arm = contacts.point[env, i] - bodies.com[env, b]
-                            du += real(2 * side - 1) * change(next_velocity[env, b] - bodies.free_velocity[env, b], arm)
+                            du += real(2 * side - 1) * point_velocity(next_velocity[env, b] - bodies.free_velocity[env, b], arm)
                     relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
                     k = contacts.directions[env, i]
                     mu = contacts.mu[env, i]

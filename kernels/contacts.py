@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from . import rigid
 from .collide import NO_POINT, pair_functions
 from .types import FACETS, FREE, OVERFLOW, REGULARIZED, scalar_types
 
@@ -31,7 +32,7 @@ IMPULSE_FLOOR = wp.constant(1.0e-2)
 def row_functions(real) -> SimpleNamespace:
     """What a contact row is made of."""
     t = scalar_types(real)
-    vec2, vec3, mat33, spatial = t.vec2, t.vec3, t.mat33, t.spatial
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     vec5 = wp.types.vector(length=5, dtype=real)
 
     @wp.struct
@@ -52,11 +53,6 @@ def row_functions(real) -> SimpleNamespace:
         directions: int
         closed: bool
         state: int
-
-    @wp.func
-    def point_velocity(twist: spatial, arm: vec3) -> vec3:
-        """Velocity of the material point of a body at `arm` from its centre of mass, world axes."""
-        return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
 
     @wp.func
     def side_mobility(inv_mass: real, inv_inertia: mat33, arm: vec3) -> mat33:
@@ -198,7 +194,7 @@ def row_functions(real) -> SimpleNamespace:
     return SimpleNamespace(
         History=History,
         vec5=vec5,
-        point_velocity=point_velocity,
+        point_velocity=rigid.functions(real).point_velocity,
         side_mobility=side_mobility,
         contact_parameters=contact_parameters,
         make_row=make_row,

@@ -10,6 +10,7 @@ import functools
 
 import warp as wp
 
+from . import rigid
 from .certify import law
 from .types import ITERATION_LIMIT, scalar_types
 
@@ -21,34 +22,25 @@ def make(real):
     vec2, vec3, spatial = t.vec2, t.vec3, t.spatial
     Bodies, Contacts = t.Bodies, t.Contacts
     project_friction = law(real).project_friction
+    f = rigid.functions(real)
+    point_velocity, impulse_response = f.point_velocity, f.impulse_response
 
     @wp.func
-    def relative(bodies: Bodies, velocity: wp.array2d(dtype=spatial), env: int, body: wp.vec2i, point: vec3) -> vec3:
+    def relative(
+        velocity: wp.array2d(dtype=spatial),
+        free: wp.array2d(dtype=spatial),
+        com: wp.array2d(dtype=vec3),
+        env: int,
+        body: wp.vec2i,
+        point: vec3,
+    ) -> vec3:
         """J (v - v_free) at a contact, world axes."""
         u = vec3()
         for side in range(2):
             b = body[side]
             if b >= 0:
-                twist = velocity[env, b] - bodies.free_velocity[env, b]
-                u_b = wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), point - bodies.com[env, b])
-                if side == 0:
-                    u -= u_b
-                else:
-                    u += u_b
+                u += real(2 * side - 1) * point_velocity(velocity[env, b] - free[env, b], point - com[env, b])
         return u
-
-    @wp.func
-    def apply(bodies: Bodies, velocity: wp.array2d(dtype=spatial), env: int, body: wp.vec2i, point: vec3, impulse: vec3):
-        """v += M^-1 J^T p for one impulse, world axes."""
-        for side in range(2):
-            b = body[side]
-            if b >= 0 and bodies.inv_mass[env, b] > real(0.0):
-                p = impulse
-                if side == 0:
-                    p = -impulse
-                dv = bodies.inv_mass[env, b] * p
-                dw = bodies.inv_inertia[env, b] * wp.cross(point - bodies.com[env, b], p)
-                velocity[env, b] = velocity[env, b] + spatial(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
 
     @wp.kernel(module="unique", enable_backward=False)
     def pgs(
@@ -86,16 +78,28 @@ def make(real):
                     p = contacts.impulse[env, i]
                     old = p
 
-                    relaxed = free + frame * relative(bodies, velocity, env, body, point) + wp.cw_mul(eps, p)
+                    relaxed = free + frame * relative(velocity, bodies.free_velocity, bodies.com, env, body, point) + wp.cw_mul(eps, p)
                     p[0] = wp.max(p[0] - relaxed[0] / diagonal[0], real(0.0))
-                    apply(bodies, velocity, env, body, point, frame[0] * (p[0] - old[0]))
+                    push = frame[0] * (p[0] - old[0])
+                    for side in range(2):
+                        b = body[side]
+                        if b >= 0:
+                            arm = point - bodies.com[env, b]
+                            sign = real(2 * side - 1)
+                            velocity[env, b] += impulse_response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * push)
                     k = contacts.directions[env, i]
                     if k > 0:
-                        relaxed = free + frame * relative(bodies, velocity, env, body, point) + wp.cw_mul(eps, p)
+                        relaxed = free + frame * relative(velocity, bodies.free_velocity, bodies.com, env, body, point) + wp.cw_mul(eps, p)
                         x = vec2(p[1] - relaxed[1] / diagonal[1], p[2] - relaxed[2] / diagonal[2])
                         x = project_friction(x, p[0], contacts.mu[env, i], k)
                         p = vec3(p[0], x[0], x[1])
-                        apply(bodies, velocity, env, body, point, frame[1] * (p[1] - old[1]) + frame[2] * (p[2] - old[2]))
+                        push = frame[1] * (p[1] - old[1]) + frame[2] * (p[2] - old[2])
+                        for side in range(2):
+                            b = body[side]
+                            if b >= 0:
+                                arm = point - bodies.com[env, b]
+                                sign = real(2 * side - 1)
+                                velocity[env, b] += impulse_response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * push)
                     contacts.impulse[env, i] = p
                     change = wp.max(change, wp.max(wp.abs(wp.cw_mul(diagonal, p - old))))
                 sweep += 1

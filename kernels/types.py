@@ -13,9 +13,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-# Body kinds and shape types as warp_lcp.model numbers them.
+# Joint types as warp_lcp.model numbers them.
 FREE = wp.constant(0)
-KINEMATIC = wp.constant(1)
 FIXED = wp.constant(2)
 
 # Contact states reported per contact.
