@@ -87,6 +87,55 @@ def test_single_precision_never_claims_what_it_has_not(shared):
         assert (minmap(data["M"], data["q"], z.astype(float))[claimed] < 2e-3).all()
 
 
+@pytest.mark.parametrize("k", [2, 3])
+@pytest.mark.parametrize("speed", [0.0, 5.0])
+def test_the_assembled_lcp_is_that_of_the_paper(k, speed):
+    """Lead matrix and vector against eq. 39 written out and eliminated with numpy; full rank, and not without rho.
+
+    1e-9 of the largest entry: A has condition 1e3 to 1e5 at 1 ms.
+    """
+    sim = simulator(paper_box((0.0, speed, 0.0), speed), directions=k, method="lemke", rho_scale=0.7)
+    sim.step()
+    rows, r = sim.rows, int(sim.contacts.count.numpy()[0])
+    frame, point, eps, free = (getattr(rows, name).numpy()[0, :r] for name in ("frame", "point", "relaxation", "free"))
+    mu, directions = rows.mu.numpy()[0, :r], rows.directions.numpy()[0, :r]
+    assert (directions == (2 if speed else k)).all()
+    arm = point - sim.bodies.com.numpy()[0, 0]
+    J = np.concatenate([frame, np.cross(arm[:, None], frame)], axis=2)  # [r, 3, 6]
+    J_n, J_t = J[:, 0], J[:, 1:].reshape(2 * r, 6)
+    m = directions[0]
+    E_i = np.array([[np.cos(j * np.pi / m) for j in range(m)], [np.sin(j * np.pi / m) for j in range(m)]])
+    E = np.kron(np.eye(r), E_i)
+    inverse_mass = np.diag([1, 1, 1, 6, 6, 6])
+    rho = 0.7 * np.diag(np.diag(E.T @ np.linalg.solve(J_t @ inverse_mass @ J_t.T + np.diag(eps[:, 1:].ravel()), E)))
+
+    def lead(rho):
+        """Unknowns (v - v_free, p_t | p_n, w_up, w_lo): the first two have equations and are eliminated."""
+        top = np.block([[np.linalg.inv(inverse_mass), -J_t.T], [J_t, np.diag(eps[:, 1:].ravel())]])
+        right = np.block([[-J_n.T, np.zeros((6, 2 * m * r))], [np.zeros((2 * r, r)), -E, E]])
+        left = np.block([[J_n, np.zeros((r, 2 * r))], [np.zeros((m * r, 6)), E.T], [np.zeros((m * r, 6)), -E.T]])
+        friction = np.kron(np.diag(mu[:, 0]), np.ones((m, 1)))
+        o = np.zeros((m * r, m * r))
+        corner = np.block([[np.diag(eps[:, 0]), np.zeros((r, 2 * m * r))], [friction, o, rho], [friction, rho, o]])
+        known = np.r_[np.zeros(6), free[:, 1:].ravel()]
+        return corner - left @ np.linalg.solve(top, right), np.r_[free[:, 0], np.zeros(2 * m * r)] - left @ np.linalg.solve(top, known)
+
+    # The library goes contact by contact: p_n, w_up, w_lo.
+    order = np.concatenate([np.r_[i, r + m * i + np.arange(m), r + m * r + m * i + np.arange(m)] for i in range(r)])
+    M, q = lead(rho)
+    n = r * (1 + 2 * m)
+    found = sim._methods[0].lcp.M.numpy()[0, :n, :n]
+    assert found == pytest.approx(M[np.ix_(order, order)], abs=1e-9 * np.abs(M).max())
+    assert sim._methods[0].lcp.q.numpy()[0, :n] == pytest.approx(q[order], abs=1e-9 * np.abs(q).max() + 1e-12)
+
+    def rank(matrix):
+        scale = 1 / np.sqrt(np.abs(np.diag(matrix)))
+        return np.linalg.matrix_rank(scale[:, None] * matrix * scale, tol=1e-9)
+
+    assert rank(found) == n
+    assert rank(lead(0 * rho)[0][np.ix_(order, order)]) <= n - m * r  # the paper's point: each direction counted twice
+
+
 @pytest.mark.parametrize(("k", "share"), [(2, 1.0), (3, 1.0), (4, 0.99), (8, 0.99)])
 def test_facets_of_the_simulator(k, share):
     """Fixed facets on 64 boxes thrown a little differently, h = 10 ms, Lemke without fallback.
