@@ -1,0 +1,371 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Proximal semismooth Newton on contact problems  u = W p + q,  p = pi(p - rho u)  (kernels/friction.py), any law, any W.
+
+For the impulses p of all contacts, rho = 1 / W_ii of each contact (one number for its normal, one for its tangents),
+
+    F(p) = p - pi(x),    x = p - rho (W p + q) - alpha (p - c).
+
+alpha = 0 is the problem; alpha > 0 holds p near the centre c, which makes the equations regular however redundant the contacts
+are (proximal point method). A Newton step solves
+
+    (1 - D + D (rho W + alpha)) dp = -F,    D in the generalised derivative of pi at x,
+
+a block-sparse system (kernels/sparse.py), and is shortened until sum F^2 / rho falls. Once it has fallen to a tenth, c moves to
+p and alpha shrinks with it, so that the end is Newton's method on the problem itself. Where a step cannot be found alpha grows
+and a few sweeps of block Gauss-Seidel take p elsewhere. The start is what Gauss-Seidel reaches in a few sweeps.
+
+Sources: Alart and Curnier 1991 (F and its Newton's method); proximal point around it: Acary, Bremond and Huber 2018.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from . import friction, sparse
+from .types import ITERATION_LIMIT, LANES, NOT_A_NUMBER, UNCERTIFIED, scalar_types, sync
+
+# Sweeps of Gauss-Seidel at the start, and where Newton's method stalls.
+START_SWEEPS = 20
+RESTART_SWEEPS = 5
+# Newton steps around one centre.
+CENTRE_STEPS = 20
+# A step is halved so many times.
+HALVINGS = 7
+
+
+@functools.cache
+def functions(real) -> SimpleNamespace:
+    """Bundle ``ContactProblem`` and the functions ``weigh``, ``proximal_newton`` and ``law_error``."""
+    t = scalar_types(real)
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    double = real is wp.float64
+    alpha_start = real(1.0e-3)
+    alpha_least = real(1.0e-9) if double else real(1.0e-5)
+    law = friction.functions(real)
+    admissible, slope, project_friction = law.admissible, law.slope, law.project_friction
+    s = sparse.functions(real)
+    Graph, clear_factors, factorise, solve = s.Graph, s.clear_factors, s.factorise, s.solve
+
+    @wp.struct
+    class ContactProblem:
+        """One contact problem in each of P workspaces; W is in Graph.diagonal and Graph.block."""
+
+        free: wp.array2d(dtype=vec3)  # [P, n] q, m/s
+        mu: wp.array2d(dtype=vec2)  # [P, n]
+        bound: wp.array2d(dtype=vec2)  # [P, n] N s
+        directions: wp.array2d(dtype=int)  # [P, n] admissible set, kernels/friction.py
+        rho: wp.array2d(dtype=vec3)  # [P, n] kg
+        impulse: wp.array2d(dtype=vec3)  # [P, n] p, N s
+        velocity: wp.array2d(dtype=vec3)  # [P, n] u = W p + q, m/s
+        centre: wp.array2d(dtype=vec3)  # [P, n]
+        best: wp.array2d(dtype=vec3)  # [P, n] p with the least F so far
+        step: wp.array2d(dtype=vec3)  # [P, n] dp
+        change: wp.array2d(dtype=vec3)  # [P, n] W dp; scratch of the linear solver
+        error: wp.array2d(dtype=real)  # [P, n] F^2 / rho of each contact, J
+
+    @wp.func
+    def weigh(w: mat33, k: int) -> vec3:
+        """rho of a contact from its block of W; sets other than the rectangle need one mass for both tangents."""
+        d = vec3(w[0, 0], w[1, 1], w[2, 2])
+        if k != 2:
+            d[1] = real(0.5) * (d[1] + d[2])
+            d[2] = d[1]
+        rho = vec3()
+        for i in range(3):
+            rho[i] = real(1.0)  # a direction in which nothing moves
+            if d[i] > real(0.0):
+                rho[i] = real(1.0) / d[i]
+        return rho
+
+    @wp.func
+    def law_error(u: vec3, p: vec3, rho: vec3, mu: vec2, bound: vec2, k: int) -> vec3:
+        """Violation of the law by one contact [m/s] along n, t1, t2."""
+        x = p - wp.cw_mul(rho, u)
+        target = project_friction(vec2(x[1], x[2]), mu * wp.max(p[0], real(0.0)) + bound, k)
+        return vec3(wp.min(u[0], p[0] / rho[0]), (p[1] - target[0]) / rho[1], (p[2] - target[1]) / rho[2])
+
+    @wp.func
+    def product(g: Graph, slot: int, n: int, x: wp.array2d(dtype=vec3), y: wp.array2d(dtype=vec3), lane: int):
+        """y := W x."""
+        for i in range(lane, n, wp.block_dim()):
+            total = g.diagonal[slot, i] * x[slot, i]
+            for e in range(g.row[slot, i], g.row[slot, i + 1]):
+                total += g.block[slot, e] * x[slot, g.column[slot, e]]
+            y[slot, i] = total
+        sync()
+
+    @wp.func
+    def relative_velocity(g: Graph, c: ContactProblem, slot: int, n: int, lane: int):
+        """u of the present p."""
+        product(g, slot, n, c.impulse, c.velocity, lane)
+        for i in range(lane, n, wp.block_dim()):
+            c.velocity[slot, i] = c.velocity[slot, i] + c.free[slot, i]
+        sync()
+
+    @wp.func
+    def argument(c: ContactProblem, slot: int, i: int, alpha: real) -> vec3:
+        """x of contact i."""
+        p = c.impulse[slot, i]
+        return p - wp.cw_mul(c.rho[slot, i], c.velocity[slot, i]) - alpha * (p - c.centre[slot, i])
+
+    @wp.func
+    def merit(c: ContactProblem, slot: int, n: int, alpha: real, s: real, lane: int) -> real:
+        """sqrt(sum F^2 / rho) after the part s of the step."""
+        for i in range(lane, n, wp.block_dim()):
+            p = c.impulse[slot, i] + s * c.step[slot, i]
+            u = c.velocity[slot, i] + s * c.change[slot, i]
+            rho = c.rho[slot, i]
+            x = p - wp.cw_mul(rho, u) - alpha * (p - c.centre[slot, i])
+            f = p - admissible(x, c.mu[slot, i], c.bound[slot, i], c.directions[slot, i])
+            c.error[slot, i] = wp.dot(wp.cw_div(f, rho), f)
+        sync()
+        total = real(0.0)
+        for i in range(n):
+            total += c.error[slot, i]
+        sync()
+        return wp.sqrt(total)
+
+    @wp.func
+    def settle(g: Graph, c: ContactProblem, slot: int, n: int, lane: int) -> real:
+        """u and F of the present p, no proximal term, no step."""
+        relative_velocity(g, c, slot, n, lane)
+        for i in range(lane, n, wp.block_dim()):
+            c.step[slot, i] = vec3()
+            c.change[slot, i] = vec3()
+            c.centre[slot, i] = c.impulse[slot, i]
+        sync()
+        return merit(c, slot, n, real(0.0), real(0.0), lane)
+
+    @wp.func
+    def gauss_seidel(g: Graph, c: ContactProblem, slot: int, n: int, sweeps: int, lane: int):
+        """Sweeps over the contacts, each takes pi(p - rho u) at once; one lane, because the order matters."""
+        if lane == 0:
+            for _sweep in range(sweeps):
+                for i in range(n):
+                    p = c.impulse[slot, i]
+                    u = c.free[slot, i] + g.diagonal[slot, i] * p
+                    for e in range(g.row[slot, i], g.row[slot, i + 1]):
+                        u += g.block[slot, e] * c.impulse[slot, g.column[slot, e]]
+                    x = p - wp.cw_mul(c.rho[slot, i], u)
+                    c.impulse[slot, i] = admissible(x, c.mu[slot, i], c.bound[slot, i], c.directions[slot, i])
+        sync()
+
+    @wp.func
+    def newton_step(g: Graph, c: ContactProblem, slot: int, n: int, alpha: real, lane: int):
+        """step := dp, change := W dp."""
+        clear_factors(g, slot, n, lane)
+        for i in range(lane, n, wp.block_dim()):
+            x = argument(c, slot, i, alpha)
+            rho = c.rho[slot, i]
+            mu = c.mu[slot, i]
+            bound = c.bound[slot, i]
+            k = c.directions[slot, i]
+            d = slope(x, mu, bound, k)
+            c.step[slot, i] = admissible(x, mu, bound, k) - c.impulse[slot, i]
+            scaled = d * wp.diag(rho)
+            g.pivot[slot, g.step[slot, i]] = wp.identity(n=3, dtype=real) - (real(1.0) - alpha) * d + scaled * g.diagonal[slot, i]
+            for e in range(g.row[slot, i], g.row[slot, i + 1]):
+                target = g.target[slot, e]
+                if target >= 0:
+                    g.upper[slot, target] = scaled * g.block[slot, e]
+                else:
+                    g.lower[slot, -1 - target] = scaled * g.block[slot, e]
+        sync()
+        factorise(g, slot, n, lane)
+        solve(g, slot, n, c.step, c.change, lane)
+        product(g, slot, n, c.step, c.change, lane)
+
+    @wp.func
+    def advance(c: ContactProblem, slot: int, n: int, s: real, lane: int):
+        """p and u after the part s of the step."""
+        for i in range(lane, n, wp.block_dim()):
+            c.impulse[slot, i] = c.impulse[slot, i] + s * c.step[slot, i]
+            c.velocity[slot, i] = c.velocity[slot, i] + s * c.change[slot, i]
+        sync()
+
+    @wp.func
+    def proximal_newton(g: Graph, c: ContactProblem, slot: int, n: int, target: real, limit: int, lane: int) -> wp.vec2i:
+        """Solve from the p in c.impulse; returns (status bits, factorisations).
+
+        Done when sum F^2 / rho has fallen to target^2 times what no impulse leaves. The best p found is left in c.impulse.
+        """
+        size = real(0.0)
+        for i in range(n):
+            size += wp.dot(c.free[slot, i], wp.cw_mul(c.rho[slot, i], c.free[slot, i]))
+        target = target * wp.sqrt(size)
+        gauss_seidel(g, c, slot, n, START_SWEEPS, lane)
+        error = settle(g, c, slot, n, lane)
+        least = error
+        for i in range(lane, n, wp.block_dim()):
+            c.best[slot, i] = c.impulse[slot, i]
+        sync()
+        alpha = alpha_start
+        steps = int(0)
+        while error > target and steps < limit:
+            goal = real(0.1) * error
+            inner = int(0)
+            descends = bool(True)
+            while descends and error > goal and inner < CENTRE_STEPS:
+                newton_step(g, c, slot, n, alpha, lane)
+                steps += 1
+                inner += 1
+                s = real(1.0)
+                descends = False
+                for _halving in range(HALVINGS):
+                    if not descends:
+                        trial = merit(c, slot, n, alpha, s, lane)
+                        if trial < (real(1.0) - real(1.0e-4) * s) * error:
+                            descends = True
+                            error = trial
+                        else:
+                            s = real(0.5) * s
+                if descends:
+                    advance(c, slot, n, s, lane)
+            if not descends:
+                alpha = wp.min(real(10.0) * alpha, real(1.0e3))
+                gauss_seidel(g, c, slot, n, RESTART_SWEEPS, lane)
+            elif inner <= 6:
+                alpha = wp.max(real(0.2) * alpha, alpha_least)
+            elif inner > 15:
+                alpha = real(3.0) * alpha
+            error = settle(g, c, slot, n, lane)
+            if error < least:
+                least = error
+                for i in range(lane, n, wp.block_dim()):
+                    c.best[slot, i] = c.impulse[slot, i]
+                sync()
+        status = int(0)
+        if not error <= target:
+            status = ITERATION_LIMIT
+            for i in range(lane, n, wp.block_dim()):
+                c.impulse[slot, i] = c.best[slot, i]
+            sync()
+            relative_velocity(g, c, slot, n, lane)
+        return wp.vec2i(status, steps)
+
+    return SimpleNamespace(
+        Graph=Graph,
+        connect=s.connect,
+        analyse=s.analyse,
+        ContactProblem=ContactProblem,
+        weigh=weigh,
+        law_error=law_error,
+        proximal_newton=proximal_newton,
+    )
+
+
+@functools.cache
+def make(real):
+    """Kernel ``solve_contacts`` for problems given as arrays; launch tiled with dim (P), P <= B workspaces."""
+    t = scalar_types(real)
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    f = functions(real)
+    Graph, ContactProblem = f.Graph, f.ContactProblem
+    connect, analyse, weigh, law_error, proximal_newton = f.connect, f.analyse, f.weigh, f.law_error, f.proximal_newton
+    project_friction = friction.functions(real).project_friction
+
+    @wp.func
+    def block_of(W: wp.array3d(dtype=real), problem: int, i: int, j: int) -> mat33:
+        b = mat33()
+        for x in range(3):
+            for y in range(3):
+                b[x, y] = W[problem, 3 * i + x, 3 * j + y]
+        return b
+
+    @wp.func
+    def load(
+        g: Graph,
+        c: ContactProblem,
+        slot: int,
+        n: int,
+        W: wp.array3d(dtype=real),
+        q: wp.array2d(dtype=real),
+        mu: wp.array2d(dtype=real),
+        directions: int,
+        problem: int,
+        lane: int,
+    ):
+        """Graph and numbers of one problem."""
+        for i in range(lane, n, wp.block_dim()):
+            for w in range((n + 31) // 32):
+                g.adjacent[slot, i, w] = wp.uint32(0)
+            for j in range(n):
+                if j != i:
+                    coupled = bool(False)
+                    for x in range(3):
+                        for y in range(3):
+                            coupled = coupled or W[problem, 3 * i + x, 3 * j + y] != real(0.0) or W[problem, 3 * j + y, 3 * i + x] != real(0.0)
+                    if coupled:
+                        connect(g, slot, i, j)
+        sync()
+        analyse(g, slot, n, lane)
+        for i in range(lane, n, wp.block_dim()):
+            k = directions
+            if mu[problem, i] == real(0.0):
+                k = 0
+            g.diagonal[slot, i] = block_of(W, problem, i, i)
+            for e in range(g.row[slot, i], g.row[slot, i + 1]):
+                g.block[slot, e] = block_of(W, problem, i, g.column[slot, e])
+            c.free[slot, i] = vec3(q[problem, 3 * i], q[problem, 3 * i + 1], q[problem, 3 * i + 2])
+            c.mu[slot, i] = vec2(mu[problem, i], mu[problem, i])
+            c.bound[slot, i] = vec2()
+            c.directions[slot, i] = k
+            c.rho[slot, i] = weigh(g.diagonal[slot, i], k)
+            c.impulse[slot, i] = vec3()
+        sync()
+
+    @wp.func
+    def asymmetry_of(W: wp.array3d(dtype=real), problem: int, n: int) -> real:
+        """max |W - W^T| / max |W|."""
+        size = real(0.0)
+        difference = real(0.0)
+        for i in range(3 * n):
+            for j in range(3 * n):
+                size = wp.max(size, wp.abs(W[problem, i, j]))
+                difference = wp.max(difference, wp.abs(W[problem, i, j] - W[problem, j, i]))
+        result = real(0.0)
+        if size > real(0.0):
+            result = difference / size
+        return result
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    def solve_contacts(
+        W: wp.array3d(dtype=real),
+        q: wp.array2d(dtype=real),
+        mu: wp.array2d(dtype=real),
+        directions: int,
+        tolerance: real,
+        limit: int,
+        g: Graph,
+        c: ContactProblem,
+        impulse: wp.array2d(dtype=real),
+        velocity: wp.array2d(dtype=real),
+        residual: wp.array(dtype=real),
+        iterations: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+    ):
+        slot, lane = wp.tid()
+        n = mu.shape[1]
+        for problem in range(slot, mu.shape[0], c.free.shape[0]):
+            load(g, c, slot, n, W, q, mu, directions, problem, lane)
+            result = proximal_newton(g, c, slot, n, real(0.01) * tolerance, limit, lane)
+            for i in range(lane, n, wp.block_dim()):
+                for x in range(3):
+                    impulse[problem, 3 * i + x] = c.impulse[slot, i][x]
+                    velocity[problem, 3 * i + x] = c.velocity[slot, i][x]
+            if lane == 0:
+                worst = real(0.0)
+                size = real(0.0)
+                for i in range(n):
+                    e = law_error(c.velocity[slot, i], c.impulse[slot, i], c.rho[slot, i], c.mu[slot, i], vec2(), c.directions[slot, i])
+                    worst = wp.max(worst, wp.max(wp.abs(e)))
+                    size = wp.max(size, wp.max(wp.abs(c.free[slot, i])))
+                residual[problem] = worst
+                iterations[problem] = result[1]
+                status[problem] = result[0]
+                if not worst <= tolerance * size:
+                    status[problem] = result[0] | UNCERTIFIED
+            sync()
+
+    return solve_contacts

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Direct solution of block-sparse systems of 3 x 3 blocks, the contacts of one environment being the nodes of a graph.
+
+Contacts are coupled where they share a body, so a heap of hundreds of contacts has a handful of neighbours each. The graph
+is ordered once by minimum degree (the node with the fewest neighbours left goes first, its neighbours become neighbours of
+each other), which tells where the factors have blocks; every factorisation of any matrix with that pattern then touches
+those blocks only. There is no search for pivots beyond a block: whoever solves must look at the residual.
+
+The lanes of one block share one problem. Neighbours are kept as bits, one row of words a node.
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .types import scalar_types, sync
+
+# Bits in a word of the adjacency.
+WORD = 32
+
+
+@functools.cache
+def functions(real) -> SimpleNamespace:
+    """Bundle ``Graph`` and the functions ``connect``, ``analyse``, ``factorise`` and ``solve``."""
+    t = scalar_types(real)
+    vec3, mat33 = t.vec3, t.mat33
+
+    @wp.struct
+    class Graph:
+        """A symmetric pattern of at most n nodes and m blocks off the diagonal, and matrices that have it.
+
+        P workspaces. Rows of the matrix are in the caller's order, factors in the order of elimination.
+        """
+
+        adjacent: wp.array3d(dtype=wp.uint32)  # [P, n, words] neighbours of a node among those not yet eliminated
+        degree: wp.array2d(dtype=int)  # [P, n] -1 = eliminated
+        order: wp.array2d(dtype=int)  # [P, n] node of each step of elimination
+        step: wp.array2d(dtype=int)  # [P, n] its inverse
+        row: wp.array2d(dtype=int)  # [P, n + 1] first block of each row
+        column: wp.array2d(dtype=int)  # [P, m]
+        target: wp.array2d(dtype=int)  # [P, m] where the factors hold a block: upper[target], or lower[-1 - target]
+        diagonal: wp.array2d(dtype=mat33)  # [P, n]
+        block: wp.array2d(dtype=mat33)  # [P, m]
+        fill: wp.array2d(dtype=int)  # [P, n + 1] first block of each step in lower and upper
+        later: wp.array2d(dtype=int)  # [P, m] the later step that shares the block
+        pivot: wp.array2d(dtype=mat33)  # [P, n] inverse of the block on the diagonal
+        lower: wp.array2d(dtype=mat33)  # [P, m] row `later`, column of the step
+        upper: wp.array2d(dtype=mat33)  # [P, m] row of the step, column `later`
+
+    @wp.func
+    def is_neighbour(g: Graph, slot: int, i: int, j: int) -> bool:
+        return (g.adjacent[slot, i, j // WORD] >> wp.uint32(j % WORD)) & wp.uint32(1) != wp.uint32(0)
+
+    @wp.func
+    def connect(g: Graph, slot: int, i: int, j: int):
+        """Make j a neighbour of i; the caller does the same for i and j exchanged, and clears the rows before."""
+        g.adjacent[slot, i, j // WORD] = g.adjacent[slot, i, j // WORD] | (wp.uint32(1) << wp.uint32(j % WORD))
+
+    @wp.func
+    def disconnect(g: Graph, slot: int, i: int, j: int):
+        g.adjacent[slot, i, j // WORD] = g.adjacent[slot, i, j // WORD] & ~(wp.uint32(1) << wp.uint32(j % WORD))
+
+    @wp.func
+    def count(g: Graph, slot: int, i: int, words: int) -> int:
+        total = int(0)
+        for w in range(words):
+            total += wp.bit_count(g.adjacent[slot, i, w])
+        return total
+
+    @wp.func
+    def list_rows(g: Graph, slot: int, n: int, words: int, lane: int):
+        """row and column from the bits, columns ascending."""
+        for i in range(lane, n, wp.block_dim()):
+            g.degree[slot, i] = count(g, slot, i, words)
+        sync()
+        if lane == 0:
+            total = int(0)
+            for i in range(n):
+                g.row[slot, i] = total
+                total += g.degree[slot, i]
+            g.row[slot, n] = total
+        sync()
+        for i in range(lane, n, wp.block_dim()):
+            e = g.row[slot, i]
+            for w in range(words):
+                bits = g.adjacent[slot, i, w]
+                for b in range(WORD):
+                    if (bits >> wp.uint32(b)) & wp.uint32(1) != wp.uint32(0):
+                        g.column[slot, e] = WORD * w + b
+                        e += 1
+        sync()
+
+    @wp.func
+    def eliminate(g: Graph, slot: int, n: int, words: int, lane: int):
+        """Order by minimum degree; row i of the bits becomes the neighbours of i when its turn came."""
+        for s in range(n):
+            best = int(-1)
+            for i in range(n):
+                d = g.degree[slot, i]
+                if d >= 0 and (best < 0 or d < g.degree[slot, best]):
+                    best = i
+            sync()
+            if lane == 0:
+                g.order[slot, s] = best
+                g.step[slot, best] = s
+                g.degree[slot, best] = -1
+            for j in range(lane, n, wp.block_dim()):
+                if is_neighbour(g, slot, best, j):
+                    for w in range(words):
+                        g.adjacent[slot, j, w] = g.adjacent[slot, j, w] | g.adjacent[slot, best, w]
+                    disconnect(g, slot, j, j)
+                    disconnect(g, slot, j, best)
+                    g.degree[slot, j] = count(g, slot, j, words)
+            sync()
+
+    @wp.func
+    def analyse(g: Graph, slot: int, n: int, lane: int):
+        """Pattern and order from the bits (which are used up); then block and diagonal can be written."""
+        words = (n + WORD - 1) // WORD
+        list_rows(g, slot, n, words, lane)
+        eliminate(g, slot, n, words, lane)
+        if lane == 0:
+            total = int(0)
+            for s in range(n):
+                g.fill[slot, s] = total
+                total += count(g, slot, g.order[slot, s], words)
+            g.fill[slot, n] = total
+        sync()
+        for s in range(lane, n, wp.block_dim()):
+            e = g.fill[slot, s]
+            for later in range(s + 1, n):
+                if is_neighbour(g, slot, g.order[slot, s], g.order[slot, later]):
+                    g.later[slot, e] = later
+                    e += 1
+        sync()
+        for i in range(lane, n, wp.block_dim()):
+            for e in range(g.row[slot, i], g.row[slot, i + 1]):
+                s = g.step[slot, i]
+                later = g.step[slot, g.column[slot, e]]
+                first = wp.min(s, later)
+                f = g.fill[slot, first]
+                while g.later[slot, f] != wp.max(s, later):
+                    f += 1
+                if s < later:
+                    g.target[slot, e] = f
+                else:
+                    g.target[slot, e] = -1 - f
+        sync()
+
+    @wp.func
+    def clear_factors(g: Graph, slot: int, n: int, lane: int):
+        """Zero the blocks of the factors: those that fill in start so."""
+        for e in range(lane, g.fill[slot, n], wp.block_dim()):
+            g.lower[slot, e] = mat33()
+            g.upper[slot, e] = mat33()
+        sync()
+
+    @wp.func
+    def inverse(a: mat33) -> mat33:
+        """Inverse of a 3 x 3 block by elimination with row pivoting; zero where it is singular.
+
+        Cofactors (wp.inverse) lose all digits where two of three directions are nearly free.
+        """
+        b = wp.identity(n=3, dtype=real)
+        for k in range(3):
+            r = int(k)
+            for i in range(k + 1, 3):
+                if wp.abs(a[i, k]) > wp.abs(a[r, k]):
+                    r = i
+            for j in range(3):
+                x = a[r, j]
+                a[r, j] = a[k, j]
+                a[k, j] = x
+                y = b[r, j]
+                b[r, j] = b[k, j]
+                b[k, j] = y
+            p = real(0.0)
+            if a[k, k] != real(0.0):
+                p = real(1.0) / a[k, k]
+            for j in range(3):
+                a[k, j] = p * a[k, j]
+                b[k, j] = p * b[k, j]
+            for i in range(3):
+                if i != k:
+                    f = a[i, k]
+                    for j in range(3):
+                        a[i, j] = a[i, j] - f * a[k, j]
+                        b[i, j] = b[i, j] - f * b[k, j]
+        return b
+
+    @wp.func
+    def factorise(g: Graph, slot: int, n: int, lane: int):
+        """L U of the matrix in pivot, lower and upper, in place, step by step (right-looking)."""
+        for s in range(n):
+            if lane == 0:
+                g.pivot[slot, s] = inverse(g.pivot[slot, s])
+            sync()
+            begin = g.fill[slot, s]
+            end = g.fill[slot, s + 1]
+            for e in range(begin + lane, end, wp.block_dim()):
+                g.lower[slot, e] = g.lower[slot, e] * g.pivot[slot, s]
+            sync()
+            for e in range(begin + lane, end, wp.block_dim()):
+                i = g.later[slot, e]
+                left = g.lower[slot, e]
+                right = g.upper[slot, e]
+                g.pivot[slot, i] = g.pivot[slot, i] - left * right
+                target = g.fill[slot, i]
+                for f in range(e + 1, end):
+                    while g.later[slot, target] < g.later[slot, f]:
+                        target += 1
+                    g.upper[slot, target] = g.upper[slot, target] - left * g.upper[slot, f]
+                    g.lower[slot, target] = g.lower[slot, target] - g.lower[slot, f] * right
+            sync()
+
+    @wp.func
+    def solve(g: Graph, slot: int, n: int, x: wp.array2d(dtype=vec3), y: wp.array2d(dtype=vec3), lane: int):
+        """x := A^-1 x with the factors; y [P, n] is scratch."""
+        for i in range(lane, n, wp.block_dim()):
+            y[slot, g.step[slot, i]] = x[slot, i]
+        sync()
+        for s in range(n):
+            for e in range(g.fill[slot, s] + lane, g.fill[slot, s + 1], wp.block_dim()):
+                i = g.later[slot, e]
+                y[slot, i] = y[slot, i] - g.lower[slot, e] * y[slot, s]
+            sync()
+        if lane == 0:
+            for ss in range(n):
+                s = n - 1 - ss
+                total = y[slot, s]
+                for e in range(g.fill[slot, s], g.fill[slot, s + 1]):
+                    total -= g.upper[slot, e] * y[slot, g.later[slot, e]]
+                y[slot, s] = g.pivot[slot, s] * total
+        sync()
+        for i in range(lane, n, wp.block_dim()):
+            x[slot, i] = y[slot, g.step[slot, i]]
+        sync()
+
+    return SimpleNamespace(
+        Graph=Graph, connect=connect, analyse=analyse, clear_factors=clear_factors, factorise=factorise, solve=solve
+    )
