@@ -7,9 +7,9 @@ contact velocity u~ = J v+ + epsilon p + d (eq. 39), and per contact, with effec
     normal      r_n = min(u~_n, p_n / m_n)                           [m/s]
     tangential  r_t = (p_t - P(p_t - m u~_t)) / m                    [m/s]
 
-where P projects on the admissible friction impulses {|e_j . p_t| <= mu_j p_n}: this is the complementarity of eqs.
-36-38 with w_up, w_lo eliminated, and phantom inertia does not appear because w_up w_lo = 0. The residual is the largest
-of them; sum m r^2 / 2 is the unit-consistent energy error E_uc [J].
+where P projects on the admissible friction impulses of the law that was solved (kernels/friction.py); for facets this is the
+complementarity of eqs. 36-38 with w_up, w_lo eliminated, and phantom inertia does not appear because w_up w_lo = 0. The
+residual is the largest of them; sum m r^2 / 2 is the unit-consistent energy error E_uc [J].
 """
 
 import functools
@@ -17,44 +17,11 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import rigid
+from . import friction, rigid
 from .types import FIXED, NOT_A_NUMBER, OPEN, SLIDE, STICK, UNCERTIFIED, scalar_types
 
 # Residual of an answer that is not a number.
 HUGE = wp.constant(1.0e30)
-
-
-@functools.cache
-def law(real) -> SimpleNamespace:
-    """The discretised friction law as a projection, for the certificate and for iterative methods."""
-    t = scalar_types(real)
-    vec2 = t.vec2
-
-    @wp.func
-    def project_polygon(x: vec2, apothem: real, k: int) -> vec2:
-        """Nearest point of the regular polygon {|e_j . p| <= apothem}, e_j at angles j pi / k."""
-        step = real(wp.pi) / real(k)
-        angle = step * wp.round(wp.atan2(x[1], x[0]) / step)
-        e = vec2(wp.cos(angle), wp.sin(angle))
-        across = vec2(-e[1], e[0])
-        half_side = apothem * wp.tan(real(0.5) * step)
-        result = x
-        if wp.dot(x, e) > apothem:
-            result = apothem * e + wp.clamp(wp.dot(x, across), -half_side, half_side) * across
-        return result
-
-    @wp.func
-    def project_friction(x: vec2, normal: real, mu: vec2, k: int) -> vec2:
-        """Nearest admissible tangential impulse for the normal impulse."""
-        p_n = wp.max(normal, real(0.0))
-        result = vec2()
-        if k == 2:
-            result = vec2(wp.clamp(x[0], -mu[0] * p_n, mu[0] * p_n), wp.clamp(x[1], -mu[1] * p_n, mu[1] * p_n))
-        elif k > 2:
-            result = project_polygon(x, mu[0] * p_n, k)
-        return result
-
-    return SimpleNamespace(project_friction=project_friction)
 
 
 @functools.cache
@@ -63,29 +30,19 @@ def make(real) -> SimpleNamespace:
     t = scalar_types(real)
     vec2, vec3, transform, spatial = t.vec2, t.vec3, t.transform, t.spatial
     Bodies, Contacts, Slots, Topology = t.Bodies, t.Contacts, t.Slots, t.Topology
-    project_friction = law(real).project_friction
+    law = friction.functions(real)
+    project_friction, weigh, law_error = law.project_friction, law.weigh, law.law_error
     body = rigid.functions(real)
     point_velocity, impulse_response = body.point_velocity, body.impulse_response
 
     @wp.func
-    def law_error(relaxed: vec3, p: vec3, w: vec3, mu: vec2, k: int):
-        """Violation of the law by one contact [m/s] along n, t1, t2, and the inverse masses w = 1 / m that weigh it."""
-        if k > 2:  # the projection on a polygon needs one mass for both axes
-            w[1] = real(0.5) * (w[1] + w[2])
-            w[2] = w[1]
-        p_t = vec2(p[1], p[2])
-        target = project_friction(p_t - vec2(relaxed[1] / w[1], relaxed[2] / w[2]), p[0], mu, k)
-        error = vec3(wp.min(relaxed[0], p[0] * w[0]), (p_t[0] - target[0]) * w[1], (p_t[1] - target[1]) * w[2])
-        return error, w
-
-    @wp.func
-    def contact_state(p: vec3, mu: vec2, k: int) -> int:
+    def contact_state(p: vec3, mu: vec2, bound: vec2, k: int) -> int:
         """Open, stick or slide: it slides where a slightly larger friction impulse would not be admissible."""
         state = OPEN
         if p[0] > real(0.0):
             state = STICK
             pressed = vec2(p[1], p[2]) * (real(1.0) + real(1.0e-6))  # not real(1.0 + ...): literals add up in single precision
-            inside = project_friction(pressed, p[0], mu, k) - pressed
+            inside = project_friction(pressed, mu * p[0] + bound, k) - pressed
             if k > 0 and wp.dot(inside, inside) > real(0.0):
                 state = SLIDE
         return state
@@ -150,11 +107,13 @@ def make(real) -> SimpleNamespace:
                     relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
                     k = contacts.directions[env, i]
                     mu = contacts.mu[env, i]
-                    error, w = law_error(relaxed, p, contacts.inv_mass[env, i] + eps, mu, k)
+                    bound = contacts.bound[env, i]
+                    w = weigh(contacts.inv_mass[env, i] + eps, k)
+                    error = law_error(relaxed, p, w, mu, bound, k)
                     worst = wp.max(worst, wp.max(wp.abs(error)))
                     energy += real(0.5) * wp.dot(wp.cw_div(error, w), error)
                     contacts.velocity[env, i] = relaxed - wp.cw_mul(eps, p) - contacts.shift[env, i]
-                    contacts.state[env, i] = contact_state(p, mu, k)
+                    contacts.state[env, i] = contact_state(p, mu, bound, k)
                 if not finite:
                     worst = real(HUGE)
 
@@ -163,13 +122,9 @@ def make(real) -> SimpleNamespace:
                     if attempt == 0:
                         best_residual[env] = real(0.0)
                         for i in range(r):
-                            free, w = law_error(
-                                contacts.free[env, i],
-                                vec3(),
-                                contacts.inv_mass[env, i] + contacts.relaxation[env, i],
-                                contacts.mu[env, i],
-                                contacts.directions[env, i],
-                            )
+                            k = contacts.directions[env, i]
+                            w = weigh(contacts.inv_mass[env, i] + contacts.relaxation[env, i], k)
+                            free = law_error(contacts.free[env, i], vec3(), w, contacts.mu[env, i], contacts.bound[env, i], k)
                             best_residual[env] = wp.max(best_residual[env], wp.max(wp.abs(free)))
                             contacts.best_impulse[env, i] = vec3()
                     if worst < best_residual[env]:

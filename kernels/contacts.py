@@ -16,7 +16,7 @@ import warp as wp
 
 from . import rigid
 from .collide import NO_POINT, pair_functions
-from .types import FACETS, FREE, OVERFLOW, REGULARIZED, scalar_types
+from .types import CONE, DISC, FACETS, FREE, OVERFLOW, REGULARIZED, scalar_types
 
 # Overlaps are pushed apart no faster than this [m/s], whatever the stiffness.
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
@@ -34,6 +34,7 @@ def row_functions(real) -> SimpleNamespace:
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     vec5 = wp.types.vector(length=5, dtype=real)
+    body = rigid.functions(real)
 
     @wp.struct
     class History:
@@ -50,15 +51,11 @@ def row_functions(real) -> SimpleNamespace:
         relaxation: vec3
         shift: vec3
         mu: vec2
+        bound: vec2
+        lateral: real  # eq. 43 where Coulomb's cone is first linearised
         directions: int
         closed: bool
         state: int
-
-    @wp.func
-    def side_mobility(inv_mass: real, inv_inertia: mat33, arm: vec3) -> mat33:
-        """M^-1 of one body seen at a point: 1/m E - [r] I^-1 [r], world axes."""
-        r = wp.skew(arm)
-        return wp.diag(vec3(inv_mass)) - r * inv_inertia * r
 
     @wp.func
     def authored(a: real, b: real, default: real) -> real:
@@ -111,8 +108,11 @@ def row_functions(real) -> SimpleNamespace:
         h: real,
         sliding: int,
         directions: int,
+        frozen: int,
     ) -> Row:
         """Row of one contact; u and u_free: present and free velocity of b relative to a, world axes; g = |gravity|.
+
+        directions: the set that a sticking contact admits (kernels/friction.py); frozen: its limit is mu p_n of the last step.
 
         mobility: what J M^-1 J^T is for world axes, of both bodies together.
         """
@@ -143,6 +143,8 @@ def row_functions(real) -> SimpleNamespace:
             d_n = wp.max(eps_n * h * k_n * phi, -real(MAX_DEPENETRATION_SPEED))
 
         eps_t = real(1.0) / (k_t * h * h + b_t * h)
+        if directions < 0:  # Anitescu and Potra: rigid friction, no bristles
+            eps_t = real(0.0)
         slip = tangent_part(u, n)
         speed = wp.length(slip)
         slides = speed >= c[4]
@@ -153,6 +155,7 @@ def row_functions(real) -> SimpleNamespace:
         d_t = -(eps_t * h) * bristle  # eq. 42
         mu_row = vec2(mu, mu)
         k = directions
+        lateral = eps_t
         # t1 lies along the slip, or along the slip to come: there the limit of a sticking contact is mu_s lambda_n exactly.
         along = slip
         if not slides:
@@ -162,8 +165,9 @@ def row_functions(real) -> SimpleNamespace:
             along = any_axis(n)
         t1 = wp.normalize(tangent_part(along, n))  # once more: a small slip is a difference of large numbers
         if slides:
-            if sliding == FACETS:
-                d_t = vec3()
+            if sliding == FACETS or sliding == CONE:
+                d_t = vec3()  # the direction of friction is that of the slip alone
+                lateral = wp.max(eps_t, speed / (mu * wp.max(impulse, real(IMPULSE_FLOOR) * weight)))
             else:
                 # Eq. 34, and eq. 43 across the sliding direction.
                 d_t = t1 * wp.dot(t1, d_t)
@@ -174,6 +178,10 @@ def row_functions(real) -> SimpleNamespace:
                     mu_row[1] = real(0.0)
         if mu == real(0.0):
             k = 0
+        bound = vec2()
+        if frozen != 0:
+            bound = mu_row * impulse
+            mu_row = vec2()
         t2 = wp.cross(n, t1)
 
         row = Row()
@@ -182,6 +190,8 @@ def row_functions(real) -> SimpleNamespace:
         row.relaxation = eps
         row.shift = vec3(d_n, wp.dot(t1, d_t), wp.dot(t2, d_t))
         row.mu = mu_row
+        row.bound = bound
+        row.lateral = lateral
         row.directions = k
         row.closed = closed
         # What velocity pivoting starts from: closed where it was loaded or is about to be, t1 named as it is expected.
@@ -194,8 +204,8 @@ def row_functions(real) -> SimpleNamespace:
     return SimpleNamespace(
         History=History,
         vec5=vec5,
-        point_velocity=rigid.functions(real).point_velocity,
-        side_mobility=side_mobility,
+        point_velocity=body.point_velocity,
+        mobility=body.mobility,
         contact_parameters=contact_parameters,
         make_row=make_row,
     )
@@ -209,7 +219,7 @@ def make(real) -> SimpleNamespace:
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     f = row_functions(real)
     History, vec5 = f.History, f.vec5
-    point_velocity, side_mobility, contact_parameters, make_row = f.point_velocity, f.side_mobility, f.contact_parameters, f.make_row
+    point_velocity, side_mobility, contact_parameters, make_row = f.point_velocity, f.mobility, f.contact_parameters, f.make_row
     shape_pose = pair_functions(real).shape_pose
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -268,6 +278,7 @@ def make(real) -> SimpleNamespace:
         h: real,
         sliding: int,
         directions: int,
+        frozen: int,
         contacts: Contacts,
         stride: int,
     ):
@@ -297,7 +308,8 @@ def make(real) -> SimpleNamespace:
                     c_b[k] = parameters.contact[env % parameters.contact.shape[0], shape, k]
                 if b >= 0 and topology.joint_type[b] == FREE:
                     m = parameters.mass[env % parameters.mass.shape[0], b]
-                    mobility += side_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], point - bodies.com[env, b])
+                    arm = point - bodies.com[env, b]
+                    mobility += side_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, arm)
                     if mass == real(0.0) or m < mass:
                         mass = m
             c = contact_parameters(c_a, c_b, mass)
@@ -307,9 +319,9 @@ def make(real) -> SimpleNamespace:
             history.bristle = slots.last_bristle[env, slot]
             u = contacts.velocity[env, i]
             u_free = contacts.free[env, i]
-            row = make_row(
-                mobility, slots.normal[env, slot], phi, slots.bend[env, slot], u, u_free, c, mu, history, g, h, sliding, directions
-            )
+            n = slots.normal[env, slot]
+            bend = slots.bend[env, slot]
+            row = make_row(mobility, n, phi, bend, u, u_free, c, mu, history, g, h, sliding, directions, frozen)
 
             contacts.body[env, i] = body
             contacts.point[env, i] = point
@@ -321,6 +333,9 @@ def make(real) -> SimpleNamespace:
             contacts.shift[env, i] = row.shift
             contacts.free[env, i] = row.frame * u_free + row.shift
             contacts.mu[env, i] = row.mu
+            contacts.bound[env, i] = row.bound
+            if row.directions == DISC:
+                contacts.slip[env, i] = vec3(real(1.0), real(0.0), row.lateral)
             contacts.directions[env, i] = row.directions
             contacts.damping[env, i] = c[3]
             contacts.impulse[env, i] = vec3()

@@ -20,14 +20,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .types import scalar_types
-
-DISC = 1
+from .types import DISC, scalar_types
 
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
-    """``project_friction``, ``admissible`` (pi) and ``slope`` (its generalised derivative)."""
+    """``project_friction``, ``admissible`` (pi), ``slope`` (its generalised derivative), ``weigh`` and ``law_error``."""
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
 
@@ -124,4 +122,25 @@ def functions(real) -> SimpleNamespace:
                 d[2, 0] = grows * mu[0] * corner[1]
         return d
 
-    return SimpleNamespace(project_friction=project_friction, admissible=admissible, slope=slope)
+    @wp.func
+    def weigh(w: vec3, k: int) -> vec3:
+        """1 / rho of a contact from the diagonal of its block of W; only the rectangle may have two masses for its tangents."""
+        result = w
+        if k != 2:
+            result[1] = real(0.5) * (w[1] + w[2])
+            result[2] = result[1]
+        for i in range(3):
+            if not result[i] > real(0.0):
+                result[i] = real(1.0)  # a direction in which nothing moves
+        return result
+
+    @wp.func
+    def law_error(u: vec3, p: vec3, w: vec3, mu: vec2, bound: vec2, k: int) -> vec3:
+        """Violation of the law by one contact [m/s] along n, t1, t2; w = 1 / rho from `weigh`.
+
+        Normal min(u_n, p_n w_n), tangential (p_t - P(p_t - rho_t u_t)) w_t, both relaxed where u is.
+        """
+        target = project_friction(vec2(p[1] - u[1] / w[1], p[2] - u[2] / w[2]), mu * wp.max(p[0], real(0.0)) + bound, k)
+        return vec3(wp.min(u[0], p[0] * w[0]), (p[1] - target[0]) * w[1], (p[2] - target[1]) * w[2])
+
+    return SimpleNamespace(project_friction=project_friction, admissible=admissible, slope=slope, weigh=weigh, law_error=law_error)

@@ -10,8 +10,7 @@ import functools
 
 import warp as wp
 
-from . import rigid
-from .certify import law
+from . import friction, rigid
 from .types import ITERATION_LIMIT, scalar_types
 
 
@@ -21,7 +20,8 @@ def make(real):
     t = scalar_types(real)
     vec2, vec3, spatial = t.vec2, t.vec3, t.spatial
     Bodies, Contacts = t.Bodies, t.Contacts
-    project_friction = law(real).project_friction
+    law = friction.functions(real)
+    project_friction, weigh = law.project_friction, law.weigh
     f = rigid.functions(real)
     point_velocity, impulse_response = f.point_velocity, f.impulse_response
 
@@ -73,7 +73,8 @@ def make(real):
                     point = contacts.point[env, i]
                     frame = contacts.frame[env, i]
                     eps = contacts.relaxation[env, i]
-                    diagonal = contacts.inv_mass[env, i] + eps
+                    k = contacts.directions[env, i]
+                    diagonal = weigh(contacts.inv_mass[env, i] + eps, k)
                     free = contacts.free[env, i]
                     p = contacts.impulse[env, i]
                     old = p
@@ -87,11 +88,10 @@ def make(real):
                             arm = point - bodies.com[env, b]
                             sign = real(2 * side - 1)
                             velocity[env, b] += impulse_response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * push)
-                    k = contacts.directions[env, i]
-                    if k > 0:
+                    if k != 0:
                         relaxed = free + frame * relative(velocity, bodies.free_velocity, bodies.com, env, body, point) + wp.cw_mul(eps, p)
                         x = vec2(p[1] - relaxed[1] / diagonal[1], p[2] - relaxed[2] / diagonal[2])
-                        x = project_friction(x, p[0], contacts.mu[env, i], k)
+                        x = project_friction(x, contacts.mu[env, i] * p[0] + contacts.bound[env, i], k)
                         p = vec3(p[0], x[0], x[1])
                         push = frame[1] * (p[1] - old[1]) + frame[2] * (p[2] - old[2])
                         for side in range(2):

@@ -23,27 +23,28 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import friction, sparse
-from .types import ITERATION_LIMIT, LANES, NOT_A_NUMBER, UNCERTIFIED, scalar_types, sync
+from .types import ITERATION_LIMIT, scalar_types, sync
 
-# Sweeps of Gauss-Seidel at the start, and where Newton's method stalls.
-START_SWEEPS = 20
+# Sweeps of Gauss-Seidel where Newton's method stalls.
 RESTART_SWEEPS = 5
 # Newton steps around one centre.
 CENTRE_STEPS = 20
+# Centres in a row that do not halve the error: round-off, or a problem without solution.
+MOST_STALLS = 30
 # A step is halved so many times.
 HALVINGS = 7
 
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
-    """Bundle ``ContactProblem`` and the functions ``weigh``, ``proximal_newton`` and ``law_error``."""
+    """Bundle ``ContactProblem`` and the function ``proximal_newton``."""
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     double = real is wp.float64
     alpha_start = real(1.0e-3)
     alpha_least = real(1.0e-9) if double else real(1.0e-5)
     law = friction.functions(real)
-    admissible, slope, project_friction = law.admissible, law.slope, law.project_friction
+    admissible, slope = law.admissible, law.slope
     s = sparse.functions(real)
     Graph, clear_factors, factorise, solve = s.Graph, s.clear_factors, s.factorise, s.solve
 
@@ -63,27 +64,6 @@ def functions(real) -> SimpleNamespace:
         step: wp.array2d(dtype=vec3)  # [P, n] dp
         change: wp.array2d(dtype=vec3)  # [P, n] W dp; scratch of the linear solver
         error: wp.array2d(dtype=real)  # [P, n] F^2 / rho of each contact, J
-
-    @wp.func
-    def weigh(w: mat33, k: int) -> vec3:
-        """rho of a contact from its block of W; sets other than the rectangle need one mass for both tangents."""
-        d = vec3(w[0, 0], w[1, 1], w[2, 2])
-        if k != 2:
-            d[1] = real(0.5) * (d[1] + d[2])
-            d[2] = d[1]
-        rho = vec3()
-        for i in range(3):
-            rho[i] = real(1.0)  # a direction in which nothing moves
-            if d[i] > real(0.0):
-                rho[i] = real(1.0) / d[i]
-        return rho
-
-    @wp.func
-    def law_error(u: vec3, p: vec3, rho: vec3, mu: vec2, bound: vec2, k: int) -> vec3:
-        """Violation of the law by one contact [m/s] along n, t1, t2."""
-        x = p - wp.cw_mul(rho, u)
-        target = project_friction(vec2(x[1], x[2]), mu * wp.max(p[0], real(0.0)) + bound, k)
-        return vec3(wp.min(u[0], p[0] / rho[0]), (p[1] - target[0]) / rho[1], (p[2] - target[1]) / rho[2])
 
     @wp.func
     def product(g: Graph, slot: int, n: int, x: wp.array2d(dtype=vec3), y: wp.array2d(dtype=vec3), lane: int):
@@ -138,18 +118,29 @@ def functions(real) -> SimpleNamespace:
         return merit(c, slot, n, real(0.0), real(0.0), lane)
 
     @wp.func
-    def gauss_seidel(g: Graph, c: ContactProblem, slot: int, n: int, sweeps: int, lane: int):
-        """Sweeps over the contacts, each takes pi(p - rho u) at once; one lane, because the order matters."""
+    def gauss_seidel(g: Graph, c: ContactProblem, slot: int, n: int, sweeps: int, least: real, lane: int) -> int:
+        """Sweeps over the contacts, each takes pi(p - rho u) at once, until sqrt(sum dp^2 / rho) <= least; returns their number.
+
+        One lane, because the order matters.
+        """
         if lane == 0:
-            for _sweep in range(sweeps):
+            done = int(0)
+            change = real(1.0e30)
+            while done < sweeps and change > least * least:
+                change = real(0.0)
                 for i in range(n):
                     p = c.impulse[slot, i]
+                    rho = c.rho[slot, i]
                     u = c.free[slot, i] + g.diagonal[slot, i] * p
                     for e in range(g.row[slot, i], g.row[slot, i + 1]):
                         u += g.block[slot, e] * c.impulse[slot, g.column[slot, e]]
-                    x = p - wp.cw_mul(c.rho[slot, i], u)
-                    c.impulse[slot, i] = admissible(x, c.mu[slot, i], c.bound[slot, i], c.directions[slot, i])
+                    after = admissible(p - wp.cw_mul(rho, u), c.mu[slot, i], c.bound[slot, i], c.directions[slot, i])
+                    change += wp.dot(after - p, wp.cw_div(after - p, rho))
+                    c.impulse[slot, i] = after
+                done += 1
+            c.error[slot, 0] = real(done)
         sync()
+        return int(c.error[slot, 0])
 
     @wp.func
     def newton_step(g: Graph, c: ContactProblem, slot: int, n: int, alpha: real, lane: int):
@@ -185,8 +176,8 @@ def functions(real) -> SimpleNamespace:
         sync()
 
     @wp.func
-    def proximal_newton(g: Graph, c: ContactProblem, slot: int, n: int, target: real, limit: int, lane: int) -> wp.vec2i:
-        """Solve from the p in c.impulse; returns (status bits, factorisations).
+    def proximal_newton(g: Graph, c: ContactProblem, slot: int, n: int, target: real, sweeps: int, limit: int, lane: int) -> wp.vec2i:
+        """Solve from the p in c.impulse; returns (status bits, sweeps and factorisations).
 
         Done when sum F^2 / rho has fallen to target^2 times what no impulse leaves. The best p found is left in c.impulse.
         """
@@ -194,15 +185,15 @@ def functions(real) -> SimpleNamespace:
         for i in range(n):
             size += wp.dot(c.free[slot, i], wp.cw_mul(c.rho[slot, i], c.free[slot, i]))
         target = target * wp.sqrt(size)
-        gauss_seidel(g, c, slot, n, START_SWEEPS, lane)
+        steps = gauss_seidel(g, c, slot, n, sweeps, real(0.1) * target, lane)
         error = settle(g, c, slot, n, lane)
         least = error
         for i in range(lane, n, wp.block_dim()):
             c.best[slot, i] = c.impulse[slot, i]
         sync()
         alpha = alpha_start
-        steps = int(0)
-        while error > target and steps < limit:
+        stalls = int(0)
+        while error > target and steps < sweeps + limit and stalls < MOST_STALLS:
             goal = real(0.1) * error
             inner = int(0)
             descends = bool(True)
@@ -224,12 +215,15 @@ def functions(real) -> SimpleNamespace:
                     advance(c, slot, n, s, lane)
             if not descends:
                 alpha = wp.min(real(10.0) * alpha, real(1.0e3))
-                gauss_seidel(g, c, slot, n, RESTART_SWEEPS, lane)
+                steps += gauss_seidel(g, c, slot, n, RESTART_SWEEPS, real(0.0), lane)
             elif inner <= 6:
                 alpha = wp.max(real(0.2) * alpha, alpha_least)
             elif inner > 15:
                 alpha = real(3.0) * alpha
             error = settle(g, c, slot, n, lane)
+            stalls += 1
+            if error < real(0.5) * least:
+                stalls = 0
             if error < least:
                 least = error
                 for i in range(lane, n, wp.block_dim()):
@@ -246,126 +240,9 @@ def functions(real) -> SimpleNamespace:
 
     return SimpleNamespace(
         Graph=Graph,
+        clear=s.clear,
         connect=s.connect,
         analyse=s.analyse,
         ContactProblem=ContactProblem,
-        weigh=weigh,
-        law_error=law_error,
         proximal_newton=proximal_newton,
     )
-
-
-@functools.cache
-def make(real):
-    """Kernel ``solve_contacts`` for problems given as arrays; launch tiled with dim (P), P <= B workspaces."""
-    t = scalar_types(real)
-    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
-    f = functions(real)
-    Graph, ContactProblem = f.Graph, f.ContactProblem
-    connect, analyse, weigh, law_error, proximal_newton = f.connect, f.analyse, f.weigh, f.law_error, f.proximal_newton
-    project_friction = friction.functions(real).project_friction
-
-    @wp.func
-    def block_of(W: wp.array3d(dtype=real), problem: int, i: int, j: int) -> mat33:
-        b = mat33()
-        for x in range(3):
-            for y in range(3):
-                b[x, y] = W[problem, 3 * i + x, 3 * j + y]
-        return b
-
-    @wp.func
-    def load(
-        g: Graph,
-        c: ContactProblem,
-        slot: int,
-        n: int,
-        W: wp.array3d(dtype=real),
-        q: wp.array2d(dtype=real),
-        mu: wp.array2d(dtype=real),
-        directions: int,
-        problem: int,
-        lane: int,
-    ):
-        """Graph and numbers of one problem."""
-        for i in range(lane, n, wp.block_dim()):
-            for w in range((n + 31) // 32):
-                g.adjacent[slot, i, w] = wp.uint32(0)
-            for j in range(n):
-                if j != i:
-                    coupled = bool(False)
-                    for x in range(3):
-                        for y in range(3):
-                            coupled = coupled or W[problem, 3 * i + x, 3 * j + y] != real(0.0) or W[problem, 3 * j + y, 3 * i + x] != real(0.0)
-                    if coupled:
-                        connect(g, slot, i, j)
-        sync()
-        analyse(g, slot, n, lane)
-        for i in range(lane, n, wp.block_dim()):
-            k = directions
-            if mu[problem, i] == real(0.0):
-                k = 0
-            g.diagonal[slot, i] = block_of(W, problem, i, i)
-            for e in range(g.row[slot, i], g.row[slot, i + 1]):
-                g.block[slot, e] = block_of(W, problem, i, g.column[slot, e])
-            c.free[slot, i] = vec3(q[problem, 3 * i], q[problem, 3 * i + 1], q[problem, 3 * i + 2])
-            c.mu[slot, i] = vec2(mu[problem, i], mu[problem, i])
-            c.bound[slot, i] = vec2()
-            c.directions[slot, i] = k
-            c.rho[slot, i] = weigh(g.diagonal[slot, i], k)
-            c.impulse[slot, i] = vec3()
-        sync()
-
-    @wp.func
-    def asymmetry_of(W: wp.array3d(dtype=real), problem: int, n: int) -> real:
-        """max |W - W^T| / max |W|."""
-        size = real(0.0)
-        difference = real(0.0)
-        for i in range(3 * n):
-            for j in range(3 * n):
-                size = wp.max(size, wp.abs(W[problem, i, j]))
-                difference = wp.max(difference, wp.abs(W[problem, i, j] - W[problem, j, i]))
-        result = real(0.0)
-        if size > real(0.0):
-            result = difference / size
-        return result
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
-    def solve_contacts(
-        W: wp.array3d(dtype=real),
-        q: wp.array2d(dtype=real),
-        mu: wp.array2d(dtype=real),
-        directions: int,
-        tolerance: real,
-        limit: int,
-        g: Graph,
-        c: ContactProblem,
-        impulse: wp.array2d(dtype=real),
-        velocity: wp.array2d(dtype=real),
-        residual: wp.array(dtype=real),
-        iterations: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-    ):
-        slot, lane = wp.tid()
-        n = mu.shape[1]
-        for problem in range(slot, mu.shape[0], c.free.shape[0]):
-            load(g, c, slot, n, W, q, mu, directions, problem, lane)
-            result = proximal_newton(g, c, slot, n, real(0.01) * tolerance, limit, lane)
-            for i in range(lane, n, wp.block_dim()):
-                for x in range(3):
-                    impulse[problem, 3 * i + x] = c.impulse[slot, i][x]
-                    velocity[problem, 3 * i + x] = c.velocity[slot, i][x]
-            if lane == 0:
-                worst = real(0.0)
-                size = real(0.0)
-                for i in range(n):
-                    e = law_error(c.velocity[slot, i], c.impulse[slot, i], c.rho[slot, i], c.mu[slot, i], vec2(), c.directions[slot, i])
-                    worst = wp.max(worst, wp.max(wp.abs(e)))
-                    size = wp.max(size, wp.max(wp.abs(c.free[slot, i])))
-                residual[problem] = worst
-                iterations[problem] = result[1]
-                status[problem] = result[0]
-                if not worst <= tolerance * size:
-                    status[problem] = result[0] | UNCERTIFIED
-            sync()
-
-    return solve_contacts

@@ -11,7 +11,7 @@ from .types import scalar_types
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
-    """``point_velocity`` and ``impulse_response``; arm: from the centre of mass to the point, world axes."""
+    """``point_velocity``, ``impulse_response`` and ``mobility``; arm: from the centre of mass to the point, world axes."""
     t = scalar_types(real)
     vec3, mat33, spatial = t.vec3, t.mat33, t.spatial
 
@@ -27,4 +27,9 @@ def functions(real) -> SimpleNamespace:
         dw = inv_inertia * wp.cross(arm, impulse)
         return spatial(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
 
-    return SimpleNamespace(point_velocity=point_velocity, impulse_response=impulse_response)
+    @wp.func
+    def mobility(inv_mass: real, inv_inertia: mat33, arm: vec3, other: vec3) -> mat33:
+        """J M^-1 J^T between two points of a body: velocity at `arm` for an impulse at `other`, 1/m E - [arm] I^-1 [other]."""
+        return wp.diag(vec3(inv_mass)) - wp.skew(arm) * inv_inertia * wp.skew(other)
+
+    return SimpleNamespace(point_velocity=point_velocity, impulse_response=impulse_response, mobility=mobility)

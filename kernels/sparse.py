@@ -22,7 +22,7 @@ WORD = 32
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
-    """Bundle ``Graph`` and the functions ``connect``, ``analyse``, ``factorise`` and ``solve``."""
+    """Bundle ``Graph`` and the functions ``clear``, ``connect``, ``analyse``, ``factorise`` and ``solve``."""
     t = scalar_types(real)
     vec3, mat33 = t.vec3, t.mat33
 
@@ -53,8 +53,14 @@ def functions(real) -> SimpleNamespace:
         return (g.adjacent[slot, i, j // WORD] >> wp.uint32(j % WORD)) & wp.uint32(1) != wp.uint32(0)
 
     @wp.func
+    def clear(g: Graph, slot: int, n: int, i: int):
+        """No neighbours yet."""
+        for w in range((n + WORD - 1) // WORD):
+            g.adjacent[slot, i, w] = wp.uint32(0)
+
+    @wp.func
     def connect(g: Graph, slot: int, i: int, j: int):
-        """Make j a neighbour of i; the caller does the same for i and j exchanged, and clears the rows before."""
+        """Make j a neighbour of i; the caller does the same for i and j exchanged."""
         g.adjacent[slot, i, j // WORD] = g.adjacent[slot, i, j // WORD] | (wp.uint32(1) << wp.uint32(j % WORD))
 
     @wp.func
@@ -69,8 +75,8 @@ def functions(real) -> SimpleNamespace:
         return total
 
     @wp.func
-    def list_rows(g: Graph, slot: int, n: int, words: int, lane: int):
-        """row and column from the bits, columns ascending."""
+    def list_rows(g: Graph, slot: int, n: int, words: int, lane: int) -> bool:
+        """row and column from the bits, columns ascending; False where there is no room for them."""
         for i in range(lane, n, wp.block_dim()):
             g.degree[slot, i] = count(g, slot, i, words)
         sync()
@@ -81,6 +87,8 @@ def functions(real) -> SimpleNamespace:
                 total += g.degree[slot, i]
             g.row[slot, n] = total
         sync()
+        if g.row[slot, n] > g.column.shape[1]:
+            return False
         for i in range(lane, n, wp.block_dim()):
             e = g.row[slot, i]
             for w in range(words):
@@ -90,6 +98,7 @@ def functions(real) -> SimpleNamespace:
                         g.column[slot, e] = WORD * w + b
                         e += 1
         sync()
+        return True
 
     @wp.func
     def eliminate(g: Graph, slot: int, n: int, words: int, lane: int):
@@ -115,10 +124,14 @@ def functions(real) -> SimpleNamespace:
             sync()
 
     @wp.func
-    def analyse(g: Graph, slot: int, n: int, lane: int):
-        """Pattern and order from the bits (which are used up); then block and diagonal can be written."""
+    def analyse(g: Graph, slot: int, n: int, lane: int) -> bool:
+        """Pattern and order from the bits (which are used up); then block and diagonal can be written.
+
+        Returns False where the workspace has no room for the blocks.
+        """
         words = (n + WORD - 1) // WORD
-        list_rows(g, slot, n, words, lane)
+        if not list_rows(g, slot, n, words, lane):
+            return False
         eliminate(g, slot, n, words, lane)
         if lane == 0:
             total = int(0)
@@ -127,6 +140,8 @@ def functions(real) -> SimpleNamespace:
                 total += count(g, slot, g.order[slot, s], words)
             g.fill[slot, n] = total
         sync()
+        if g.fill[slot, n] > g.later.shape[1]:
+            return False
         for s in range(lane, n, wp.block_dim()):
             e = g.fill[slot, s]
             for later in range(s + 1, n):
@@ -147,6 +162,7 @@ def functions(real) -> SimpleNamespace:
                 else:
                     g.target[slot, e] = -1 - f
         sync()
+        return True
 
     @wp.func
     def clear_factors(g: Graph, slot: int, n: int, lane: int):
@@ -238,5 +254,5 @@ def functions(real) -> SimpleNamespace:
         sync()
 
     return SimpleNamespace(
-        Graph=Graph, connect=connect, analyse=analyse, clear_factors=clear_factors, factorise=factorise, solve=solve
+        Graph=Graph, clear=clear, connect=connect, analyse=analyse, clear_factors=clear_factors, factorise=factorise, solve=solve
     )

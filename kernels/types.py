@@ -29,13 +29,17 @@ NOT_A_NUMBER = wp.constant(4)
 OVERFLOW = wp.constant(8)
 UNCERTIFIED = wp.constant(16)
 
+# Admissible friction of Coulomb's cone (Contacts.directions, kernels/friction.py).
+DISC = wp.constant(1)
+
 # Lanes of a block that works on one environment.
 LANES = 32
 
-# How a sliding contact is discretised (warp_lcp.Simulator, `sliding`).
+# How a sliding contact is discretised (warp_lcp.Simulator, `sliding`). FACETS keeps the set it sticks with.
 REGULARIZED = wp.constant(0)
 ALIGNED = wp.constant(1)
 FACETS = wp.constant(2)
+CONE = wp.constant(3)  # Coulomb's: nothing to discretise
 
 
 @functools.cache
@@ -107,7 +111,9 @@ def scalar_types(real) -> SimpleNamespace:
         shift: wp.array2d(dtype=vec3)  # [E, R] d, m/s
         free: wp.array2d(dtype=vec3)  # [E, R] J v_free + d (+ moving surfaces), m/s
         mu: wp.array2d(dtype=vec2)  # [E, R] friction coefficient along t1, t2
-        directions: wp.array2d(dtype=int)  # [E, R] k; 0 = no friction rows
+        bound: wp.array2d(dtype=vec2)  # [E, R] part of the friction limit that the normal impulse does not change, N s
+        directions: wp.array2d(dtype=int)  # [E, R] admissible friction: 0 none, 1 disc, k facets around it, -k within (friction.py)
+        slip: wp.array2d(dtype=vec3)  # [E, R | 0] direction (s_1, s_2) and lateral relaxation of a contact that slides on the cone
         damping: wp.array2d(dtype=real)  # [E, R] b_t, N s/m
         impulse: wp.array2d(dtype=vec3)  # [E, R] h lambda in the contact frame, N s
         best_impulse: wp.array2d(dtype=vec3)  # [E, R] likewise, of the best uncertified answer so far

@@ -13,8 +13,8 @@ import numpy as np
 import warp as wp
 
 from .errors import WarpLcpError
-from .kernels import lcp, lemke, pgs, pivoting
-from .kernels.types import LANES
+from .kernels import lcp, lemke, pgs, pivoting, problems, proximal
+from .kernels.types import LANES, scalar_types
 from .model import JointType, Model
 
 if TYPE_CHECKING:
@@ -39,6 +39,30 @@ def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
     ws.basic = wp.empty((slots, n), dtype=int, device=device)
     ws.nonbasic = wp.empty((slots, n + 1), dtype=int, device=device)
     return ws
+
+
+def contact_workspace(real: Any, slots: int, n: int, blocks: int, fill: int, device: Any) -> tuple[Any, Any]:
+    """Graph and ContactProblem of `slots` problems of at most n contacts, for the proximal kernels.
+
+    blocks: room for pairs of contacts that share a body, each counted twice; fill: room for blocks of a triangular factor.
+    """
+    t, f = scalar_types(real), proximal.functions(real)
+    graph, problem = f.Graph(), f.ContactProblem()
+
+    def empty(n: int, dtype: Any) -> wp.array:
+        return wp.empty((slots, max(n, 1)), dtype=dtype, device=device)
+
+    graph.adjacent = wp.empty((slots, n, (n + 31) // 32), dtype=wp.uint32, device=device)
+    graph.degree, graph.order, graph.step = (empty(n, int) for _ in range(3))
+    graph.row, graph.fill = empty(n + 1, int), empty(n + 1, int)
+    graph.column, graph.target, graph.later = empty(blocks, int), empty(blocks, int), empty(fill, int)
+    graph.diagonal, graph.pivot = empty(n, t.mat33), empty(n, t.mat33)
+    graph.block, graph.lower, graph.upper = empty(blocks, t.mat33), empty(fill, t.mat33), empty(fill, t.mat33)
+    problem.free, problem.rho, problem.impulse, problem.velocity = (empty(n, t.vec3) for _ in range(4))
+    problem.centre, problem.best, problem.step, problem.change = (empty(n, t.vec3) for _ in range(4))
+    problem.mu, problem.bound = empty(n, t.vec2), empty(n, t.vec2)
+    problem.directions, problem.error = empty(n, int), empty(n, real)
+    return graph, problem
 
 
 def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
@@ -69,6 +93,29 @@ class Lemke:
 
     def launch(self, sim: Simulator) -> None:
         inputs = [sim.bodies, sim.rows, sim.unsolved, sim.rho_scale, self.lcp, self.contacts, sim.iterations, sim.reason]
+        wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
+
+
+class ProximalNewton:
+    """Proximal semismooth Newton on the contacts, any law."""
+
+    SWEEPS = 20
+    LIMIT = 200
+    #: Room for coupled contacts and for blocks of a factor, per contact.
+    NEIGHBOURS, FILL = 128, 256
+
+    def __init__(self, model: Model, real: Any):
+        self.kernel = problems.make_contacts(real)
+
+    def prepare(self, sim: Simulator) -> None:
+        n = sim.model.max_contacts
+        blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
+        self.slots = workspaces(sim.num_envs, 10 * blocks + 20 * fill, sim.device)
+        self.workspace = contact_workspace(sim.real, self.slots, n, blocks, fill, sim.device)
+
+    def launch(self, sim: Simulator) -> None:
+        target = 1e-12 if sim.real is wp.float64 else 1e-6
+        inputs = [sim.bodies, sim.rows, sim.unsolved, self.SWEEPS, self.LIMIT, target, *self.workspace, sim.iterations, sim.reason]
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
@@ -125,9 +172,10 @@ class BlockPGS:
 #: Methods by the name that users give; each is tried on the environments that those before it left unsolved. Where none
 #: certifies its answer, the best is applied.
 METHODS: dict[str, tuple[type, ...]] = {
-    "auto": (VelocityPivoting, Lemke, BlockPGS),
+    "auto": (VelocityPivoting, ProximalNewton, BlockPGS),
     "lemke": (Lemke,),
     "velocity_pivoting": (VelocityPivoting,),
+    "proximal_newton": (ProximalNewton,),
     "pgs": (BlockPGS,),
 }
 

@@ -17,6 +17,7 @@ from .kernels.types import scalar_types
 from .methods import METHODS, chosen
 from .model import Model, ShapeType
 
+FORMULATIONS = ("phantom_inertia", "anitescu_potra", "box", "hybrid", "coulomb")
 SLIDING = ("regularized", "aligned", "facets")
 PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.float32)}
 #: Parameters that may differ between environments, and what their numbers must be.
@@ -118,7 +119,7 @@ class Simulator:
         device: Any = None,
         strict: bool = False,
     ):
-        _choice("formulation", formulation, ("phantom_inertia",))
+        _choice("formulation", formulation, FORMULATIONS)
         _choice("method", method, tuple(METHODS))
         _choice("sliding", sliding, SLIDING)
         _choice("precision", precision, tuple(PRECISIONS))
@@ -134,6 +135,7 @@ class Simulator:
         self.model, self.num_envs, self.dt = model, int(num_envs), float(dt)
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.directions, self.rho_scale, self.strict = int(directions), float(rho_scale), bool(strict)
+        self._law = _law(formulation, sliding, self.directions)
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
         self.tolerance = TOLERANCE
@@ -277,8 +279,7 @@ class Simulator:
         self.unsolved.fill_(1)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
-        sliding = SLIDING.index(self.sliding)
-        rows = [*scene, self.bodies, self.slots, h, sliding, self.directions, self.rows]
+        rows = [*scene, self.bodies, self.slots, h, *self._law, self.rows]
         self.launch(k.contact_rows, rows, self.model.max_contacts)
         for i, method in enumerate(self._methods):
             method.launch(self)
@@ -359,8 +360,9 @@ class Simulator:
         rows.point, rows.inv_mass, rows.relaxation, rows.shift, rows.free, rows.impulse, rows.velocity, rows.best_impulse = (
             self._array(r, t.vec3) for _ in range(8)
         )
+        rows.slip = self._array(r if self.formulation == "coulomb" else 0, t.vec3)
         rows.gap, rows.damping = self._array(r, self.real), self._array(r, self.real)
-        rows.frame, rows.mu = self._array(r, t.mat33), self._array(r, t.vec2)
+        rows.frame, rows.mu, rows.bound = self._array(r, t.mat33), self._array(r, t.vec2), self._array(r, t.vec2)
 
         self.q, self.q0 = self._array(m.nq, self.real), self._array(m.nq, self.real)
         self.v, self.v0 = self._array(m.nv, self.real), self._array(m.nv, self.real)
@@ -410,6 +412,18 @@ def kernel_names(model: Model, method: str = "auto", precision: str = "float64")
     stages, pairs = stage_kernels(model, real)
     solvers = [kind(model, real).kernel for kind in chosen(method, precision)]
     return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *(k for k, *_ in pairs), *solvers)]
+
+
+def _law(formulation: str, sliding: str, directions: int) -> tuple[int, int, int]:
+    """What kernels/contacts.py needs to know of a contact law: (sliding, directions of a sticking contact, frozen limits?)."""
+    fixed = SLIDING.index("facets")
+    return {
+        "phantom_inertia": (SLIDING.index(sliding), directions, 0),
+        "anitescu_potra": (fixed, -directions, 0),
+        "box": (fixed, directions, 1),
+        "hybrid": (SLIDING.index("regularized"), directions, 1),
+        "coulomb": (len(SLIDING), 1, 0),
+    }[formulation]
 
 
 def _choice(what: str, value: str, choices: tuple[str, ...]) -> None:

@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contact problems for the proximal method: given as arrays (W, q, mu), or the contact rows of an environment."""
+
+import functools
+
+import warp as wp
+
+from . import friction, proximal, rigid
+from .types import DISC, ITERATION_LIMIT, LANES, UNCERTIFIED, scalar_types, sync
+
+
+@functools.cache
+def make(real):
+    """Kernel ``solve_contacts`` for B problems of n contacts given as arrays; launch tiled with dim (P), P <= B workspaces."""
+    t = scalar_types(real)
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    f = proximal.functions(real)
+    Graph, ContactProblem = f.Graph, f.ContactProblem
+    clear, connect, analyse, proximal_newton = f.clear, f.connect, f.analyse, f.proximal_newton
+    law = friction.functions(real)
+    admissible, weigh, law_error = law.admissible, law.weigh, law.law_error
+
+    @wp.func
+    def block_of(W: wp.array3d(dtype=real), problem: int, i: int, j: int) -> mat33:
+        b = mat33()
+        for x in range(3):
+            for y in range(3):
+                b[x, y] = W[problem, 3 * i + x, 3 * j + y]
+        return b
+
+    @wp.func
+    def couple(g: Graph, slot: int, n: int, W: wp.array3d(dtype=real), problem: int, lane: int) -> vec2:
+        """Neighbours from the blocks that are not zero; returns max |W| and max |W - W^T| over the rows of this lane."""
+        size = real(0.0)
+        difference = real(0.0)
+        for i in range(lane, n, wp.block_dim()):
+            clear(g, slot, n, i)
+            for j in range(n):
+                coupled = bool(False)
+                for x in range(3):
+                    for y in range(3):
+                        a = W[problem, 3 * i + x, 3 * j + y]
+                        b = W[problem, 3 * j + y, 3 * i + x]
+                        coupled = coupled or a != real(0.0) or b != real(0.0)
+                        size = wp.max(size, wp.abs(a))
+                        difference = wp.max(difference, wp.abs(a - b))
+                if coupled and j != i:
+                    connect(g, slot, i, j)
+        sync()
+        return vec2(size, difference)
+
+    @wp.func
+    def load(
+        g: Graph,
+        c: ContactProblem,
+        slot: int,
+        n: int,
+        W: wp.array3d(dtype=real),
+        q: wp.array2d(dtype=real),
+        mu: wp.array2d(dtype=real),
+        directions: int,
+        problem: int,
+        lane: int,
+    ):
+        """Numbers of one problem, cold start."""
+        for i in range(lane, n, wp.block_dim()):
+            k = directions
+            if mu[problem, i] == real(0.0):
+                k = 0
+            w = block_of(W, problem, i, i)
+            g.diagonal[slot, i] = w
+            for e in range(g.row[slot, i], g.row[slot, i + 1]):
+                g.block[slot, e] = block_of(W, problem, i, g.column[slot, e])
+            c.free[slot, i] = vec3(q[problem, 3 * i], q[problem, 3 * i + 1], q[problem, 3 * i + 2])
+            c.mu[slot, i] = vec2(mu[problem, i], mu[problem, i])
+            c.bound[slot, i] = vec2()
+            c.directions[slot, i] = k
+            inverse = weigh(wp.get_diag(w), k)
+            c.rho[slot, i] = vec3(real(1.0) / inverse[0], real(1.0) / inverse[1], real(1.0) / inverse[2])
+            c.impulse[slot, i] = vec3()
+        sync()
+
+    @wp.func
+    def natural_map(p: vec3, u: vec3, mu: real) -> vec3:
+        """p - P_K(p - u^), u^ = u + mu |u_t| n, K the cone |p_t| <= mu p_n (Acary, Bremond and Huber 2018)."""
+        x = p - u - vec3(mu * wp.sqrt(u[1] * u[1] + u[2] * u[2]), real(0.0), real(0.0))
+        size = wp.sqrt(x[1] * x[1] + x[2] * x[2])
+        projected = x
+        if size > mu * x[0]:
+            projected = vec3()
+            if mu * size > -x[0]:
+                normal = (x[0] + mu * size) / (real(1.0) + mu * mu)
+                projected = vec3(normal, mu * normal * x[1] / size, mu * normal * x[2] / size)
+        return p - projected
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    def solve_contacts(
+        W: wp.array3d(dtype=real),
+        q: wp.array2d(dtype=real),
+        mu: wp.array2d(dtype=real),
+        directions: int,
+        newton_limit: int,
+        sweeps: int,
+        tolerance: real,
+        g: Graph,
+        c: ContactProblem,
+        impulse: wp.array2d(dtype=real),
+        velocity: wp.array2d(dtype=real),
+        residual: wp.array(dtype=real),
+        cone_residual: wp.array2d(dtype=real),
+        asymmetry: wp.array2d(dtype=real),
+        iterations: wp.array(dtype=int),
+        status: wp.array(dtype=int),
+    ):
+        """newton_limit = 0: nothing but `sweeps` of block Gauss-Seidel. cone_residual [B, 2]: relative natural map, E_uc [J] of
+        the exact cone; asymmetry [B, 2], zero before: max |W|, max |W - W^T|."""
+        slot, lane = wp.tid()
+        n = mu.shape[1]
+        for problem in range(slot, mu.shape[0], c.free.shape[0]):
+            sizes = couple(g, slot, n, W, problem, lane)
+            wp.atomic_max(asymmetry, problem, 0, sizes[0])
+            wp.atomic_max(asymmetry, problem, 1, sizes[1])
+            analyse(g, slot, n, lane)  # there is room: the workspace is made for n
+            load(g, c, slot, n, W, q, mu, directions, problem, lane)
+            result = proximal_newton(g, c, slot, n, real(0.01) * tolerance, sweeps, newton_limit, lane)
+            if lane == 0:
+                # Everything below from W, q, mu and p alone, with W as it was given.
+                worst = real(0.0)
+                size = real(0.0)
+                natural = real(0.0)
+                square = real(0.0)
+                energy = real(0.0)
+                for i in range(n):
+                    p = c.impulse[slot, i]
+                    free = vec3(q[problem, 3 * i], q[problem, 3 * i + 1], q[problem, 3 * i + 2])
+                    u = free
+                    for j in range(3 * n):
+                        x = c.impulse[slot, j // 3][j % 3]
+                        if x != real(0.0):
+                            u += x * vec3(W[problem, 3 * i, j], W[problem, 3 * i + 1, j], W[problem, 3 * i + 2, j])
+                    k = c.directions[slot, i]
+                    diagonal = wp.get_diag(g.diagonal[slot, i])
+                    m = vec2(mu[problem, i], mu[problem, i])
+                    worst = wp.max(worst, wp.max(wp.abs(law_error(u, p, weigh(diagonal, k), m, vec2(), k))))
+                    size = wp.max(size, wp.max(wp.abs(free)))
+                    w = weigh(diagonal, DISC)
+                    cone = law_error(u, p, w, m, vec2(), DISC)
+                    energy += real(0.5) * wp.dot(wp.cw_div(cone, w), cone)
+                    map = natural_map(p, u, m[0])
+                    natural += wp.dot(map, map)
+                    square += wp.dot(free, free)
+                    for x in range(3):
+                        impulse[problem, 3 * i + x] = p[x]
+                        velocity[problem, 3 * i + x] = u[x]
+                residual[problem] = worst
+                cone_residual[problem, 0] = real(0.0)
+                if square > real(0.0):
+                    cone_residual[problem, 0] = wp.sqrt(natural / square)
+                cone_residual[problem, 1] = energy
+                iterations[problem] = result[1]
+                status[problem] = 0
+                if not worst <= tolerance * size:
+                    status[problem] = result[0] | UNCERTIFIED
+            sync()
+
+    return solve_contacts
+
+
+@functools.cache
+def make_contacts(real):
+    """Kernel ``proximal_contacts`` for the rows of environments; launch tiled with dim (P)."""
+    t = scalar_types(real)
+    vec3, mat33 = t.vec3, t.mat33
+    Bodies, Contacts = t.Bodies, t.Contacts
+    f = proximal.functions(real)
+    Graph, ContactProblem = f.Graph, f.ContactProblem
+    clear, connect, analyse, proximal_newton = f.clear, f.connect, f.analyse, f.proximal_newton
+    weigh = friction.functions(real).weigh
+    mobility = rigid.functions(real).mobility
+
+    @wp.func
+    def couple(g: Graph, slot: int, n: int, body: wp.array2d(dtype=wp.vec2i), inv_mass: wp.array2d(dtype=real), env: int, lane: int):
+        """Contacts that share a movable body are neighbours."""
+        for i in range(lane, n, wp.block_dim()):
+            clear(g, slot, n, i)
+            for j in range(n):
+                if j != i:
+                    for x in range(2):
+                        b = body[env, i][x]
+                        if b >= 0:
+                            if inv_mass[env, b] > real(0.0) and (body[env, j][0] == b or body[env, j][1] == b):
+                                connect(g, slot, i, j)
+        sync()
+
+    @wp.func
+    def block_of(
+        body: wp.array2d(dtype=wp.vec2i),
+        point: wp.array2d(dtype=vec3),
+        frame: wp.array2d(dtype=mat33),
+        com: wp.array2d(dtype=vec3),
+        inv_mass: wp.array2d(dtype=real),
+        inv_inertia: wp.array2d(dtype=mat33),
+        env: int,
+        i: int,
+        j: int,
+    ) -> mat33:
+        """Block (i, j) of J M^-1 J^T, rows and columns n t1 t2."""
+        total = mat33()
+        for x in range(2):
+            b = body[env, i][x]
+            if b >= 0:
+                for y in range(2):
+                    if body[env, j][y] == b:
+                        block = mobility(inv_mass[env, b], inv_inertia[env, b], point[env, i] - com[env, b], point[env, j] - com[env, b])
+                        if x == y:
+                            total += block
+                        else:
+                            total -= block
+        return frame[env, i] * total * wp.transpose(frame[env, j])
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    def proximal_contacts(
+        bodies: Bodies,
+        contacts: Contacts,
+        unsolved: wp.array(dtype=int),
+        sweeps: int,
+        limit: int,
+        target: real,
+        g: Graph,
+        c: ContactProblem,
+        iterations: wp.array(dtype=int),
+        reason: wp.array(dtype=int),
+    ):
+        slot, lane = wp.tid()
+        for env in range(slot, contacts.count.shape[0], c.free.shape[0]):
+            n = contacts.count[env]
+            if unsolved[env] == 0 or n == 0:
+                continue
+            couple(g, slot, n, contacts.body, bodies.inv_mass, env, lane)
+            if analyse(g, slot, n, lane):
+                for i in range(lane, n, wp.block_dim()):
+                    for e in range(g.row[slot, i], g.row[slot, i + 1]):
+                        g.block[slot, e] = block_of(
+                            contacts.body,
+                            contacts.point,
+                            contacts.frame,
+                            bodies.com,
+                            bodies.inv_mass,
+                            bodies.inv_inertia,
+                            env,
+                            i,
+                            g.column[slot, e],
+                        )
+                    w = block_of(
+                        contacts.body, contacts.point, contacts.frame, bodies.com, bodies.inv_mass, bodies.inv_inertia, env, i, i
+                    ) + wp.diag(contacts.relaxation[env, i])
+                    g.diagonal[slot, i] = w
+                    k = contacts.directions[env, i]
+                    inverse = weigh(wp.get_diag(w), k)
+                    c.rho[slot, i] = vec3(real(1.0) / inverse[0], real(1.0) / inverse[1], real(1.0) / inverse[2])
+                    c.free[slot, i] = contacts.free[env, i]
+                    c.mu[slot, i] = contacts.mu[env, i]
+                    c.bound[slot, i] = contacts.bound[env, i]
+                    c.directions[slot, i] = k
+                    c.impulse[slot, i] = vec3()
+                sync()
+                result = proximal_newton(g, c, slot, n, target, sweeps, limit, lane)
+                for i in range(lane, n, wp.block_dim()):
+                    contacts.impulse[env, i] = c.impulse[slot, i]
+                if lane == 0:
+                    iterations[env] = iterations[env] + result[1]
+                    reason[env] = reason[env] | result[0]
+            elif lane == 0:
+                reason[env] = reason[env] | ITERATION_LIMIT  # more coupled contacts than the workspace has room for
+            sync()
+
+    return proximal_contacts
