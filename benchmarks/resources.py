@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import warp as wp
-from warp_lcp.kernels import lemke, watch
+from warp_lcp.kernels import lemke, problems, watch
 
 import warp_lcp as wl
 from warp_lcp.methods import METHODS
@@ -50,7 +50,8 @@ def scenes() -> list[wl.Model]:
 
 def kernels(precision: str) -> dict[str, wp.Kernel]:
     """Every kernel of one precision by its name."""
-    found = [lemke.make(PRECISIONS[precision][0]), watch.collect_status]
+    real = PRECISIONS[precision][0]
+    found = [lemke.make(real), problems.make(real), watch.collect_status]
     for model in scenes():
         for method in (m for m in METHODS if precision == "float64" or m != "velocity_pivoting"):
             found += wl.Simulator(model, method=method, precision=precision, device="cpu").kernels

@@ -165,7 +165,7 @@ def row_functions(real) -> SimpleNamespace:
             along = any_axis(n)
         t1 = wp.normalize(tangent_part(along, n))  # once more: a small slip is a difference of large numbers
         if slides:
-            if sliding == FACETS or sliding == CONE:
+            if sliding == FACETS or sliding == CONE:  # noqa: SIM109
                 d_t = vec3()  # the direction of friction is that of the slip alone
                 lateral = wp.max(eps_t, speed / (mu * wp.max(impulse, real(IMPULSE_FLOOR) * weight)))
             else:

@@ -301,9 +301,7 @@ def make_single(real):
                             free = turned_frame(frame, slip) * (wp.transpose(frame) * free)
                             frame = turned_frame(frame, slip)
                             eps[2] = slip[2]
-                        a, b = add_contact(
-                            a, b, frame, contacts.point[env, i] - com, sign, eps, free, contacts.mu[env, i], bound, k, state
-                        )
+                        a, b = add_contact(a, b, frame, contacts.point[env, i] - com, sign, eps, free, contacts.mu[env, i], bound, k, state)
                 x = solve(a, b)
                 solves += 1
                 flips = int(0)

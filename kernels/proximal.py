@@ -29,8 +29,9 @@ from .types import ITERATION_LIMIT, scalar_types, sync
 RESTART_SWEEPS = 5
 # Newton steps around one centre.
 CENTRE_STEPS = 20
-# Centres in a row that do not halve the error: round-off, or a problem without solution.
+# Centres in a row that do not halve the error: a problem without solution, or close to the target round-off.
 MOST_STALLS = 30
+MOST_STALLS_AT_END = 6
 # A step is halved so many times.
 HALVINGS = 7
 
@@ -39,7 +40,7 @@ HALVINGS = 7
 def functions(real) -> SimpleNamespace:
     """Bundle ``ContactProblem`` and the function ``proximal_newton``."""
     t = scalar_types(real)
-    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    vec2, vec3 = t.vec2, t.vec3
     double = real is wp.float64
     alpha_start = real(1.0e-3)
     alpha_least = real(1.0e-9) if double else real(1.0e-5)
@@ -194,6 +195,8 @@ def functions(real) -> SimpleNamespace:
         alpha = alpha_start
         stalls = int(0)
         while error > target and steps < sweeps + limit and stalls < MOST_STALLS:
+            if stalls >= MOST_STALLS_AT_END and least < real(100.0) * target:
+                break
             goal = real(0.1) * error
             inner = int(0)
             descends = bool(True)

@@ -14,6 +14,7 @@ if not (_HERE / "kernels").is_dir():
     __path__.append(str(_HERE.parent))
 
 _PUBLIC = {
+    "ContactSolution": "friction_problem",
     "JointType": "model",
     "Material": "model",
     "MissingExtra": "errors",
@@ -30,6 +31,7 @@ _PUBLIC = {
     "WarpLcpError": "errors",
     "LCPSolution": "solve",
     "load_usd": "usd",
+    "solve_contact": "friction_problem",
     "solve_lcp": "solve",
 }
 __all__ = sorted(_PUBLIC)
