@@ -77,14 +77,6 @@ def functions(real) -> SimpleNamespace:
         sync()
 
     @wp.func
-    def relative_velocity(g: Graph, c: ContactProblem, slot: int, n: int, lane: int):
-        """u of the present p."""
-        product(g, slot, n, c.impulse, c.velocity, lane)
-        for i in range(lane, n, wp.block_dim()):
-            c.velocity[slot, i] = c.velocity[slot, i] + c.free[slot, i]
-        sync()
-
-    @wp.func
     def argument(c: ContactProblem, slot: int, i: int, alpha: real) -> vec3:
         """x of contact i."""
         p = c.impulse[slot, i]
@@ -110,8 +102,9 @@ def functions(real) -> SimpleNamespace:
     @wp.func
     def settle(g: Graph, c: ContactProblem, slot: int, n: int, lane: int) -> real:
         """u and F of the present p, no proximal term, no step."""
-        relative_velocity(g, c, slot, n, lane)
+        product(g, slot, n, c.impulse, c.velocity, lane)
         for i in range(lane, n, wp.block_dim()):
+            c.velocity[slot, i] = c.velocity[slot, i] + c.free[slot, i]
             c.step[slot, i] = vec3()
             c.change[slot, i] = vec3()
             c.centre[slot, i] = c.impulse[slot, i]
@@ -186,43 +179,16 @@ def functions(real) -> SimpleNamespace:
         for i in range(n):
             size += wp.dot(c.free[slot, i], wp.cw_mul(c.rho[slot, i], c.free[slot, i]))
         target = target * wp.sqrt(size)
-        steps = gauss_seidel(g, c, slot, n, sweeps, real(0.1) * target, lane)
-        error = settle(g, c, slot, n, lane)
-        least = error
-        for i in range(lane, n, wp.block_dim()):
-            c.best[slot, i] = c.impulse[slot, i]
-        sync()
+        least = real(1.0e30)
         alpha = alpha_start
         stalls = int(0)
-        while error > target and steps < sweeps + limit and stalls < MOST_STALLS:
-            if stalls >= MOST_STALLS_AT_END and least < real(100.0) * target:
-                break
-            goal = real(0.1) * error
-            inner = int(0)
-            descends = bool(True)
-            while descends and error > goal and inner < CENTRE_STEPS:
-                newton_step(g, c, slot, n, alpha, lane)
-                steps += 1
-                inner += 1
-                s = real(1.0)
-                descends = False
-                for _halving in range(HALVINGS):
-                    if not descends:
-                        trial = merit(c, slot, n, alpha, s, lane)
-                        if trial < (real(1.0) - real(1.0e-4) * s) * error:
-                            descends = True
-                            error = trial
-                        else:
-                            s = real(0.5) * s
-                if descends:
-                    advance(c, slot, n, s, lane)
-            if not descends:
-                alpha = wp.min(real(10.0) * alpha, real(1.0e3))
-                steps += gauss_seidel(g, c, slot, n, RESTART_SWEEPS, real(0.0), lane)
-            elif inner <= 6:
-                alpha = wp.max(real(0.2) * alpha, alpha_least)
-            elif inner > 15:
-                alpha = real(3.0) * alpha
+        steps = int(0)
+        status = int(0)
+        searching = bool(True)
+        todo = int(sweeps)
+        while searching:
+            # Each function is called in one place: Warp's compilers inline them all.
+            steps += gauss_seidel(g, c, slot, n, todo, real(0.1) * target, lane)
             error = settle(g, c, slot, n, lane)
             stalls += 1
             if error < real(0.5) * least:
@@ -232,13 +198,43 @@ def functions(real) -> SimpleNamespace:
                 for i in range(lane, n, wp.block_dim()):
                     c.best[slot, i] = c.impulse[slot, i]
                 sync()
-        status = int(0)
-        if not error <= target:
-            status = ITERATION_LIMIT
-            for i in range(lane, n, wp.block_dim()):
-                c.impulse[slot, i] = c.best[slot, i]
-            sync()
-            relative_velocity(g, c, slot, n, lane)
+            at_end = least < real(100.0) * target and stalls >= MOST_STALLS_AT_END
+            if error <= target:
+                searching = False
+            elif steps >= sweeps + limit or stalls >= MOST_STALLS or at_end:
+                status = ITERATION_LIMIT
+                searching = False
+            else:
+                goal = real(0.1) * error
+                inner = int(0)
+                descends = bool(True)
+                while descends and error > goal and inner < CENTRE_STEPS:
+                    newton_step(g, c, slot, n, alpha, lane)
+                    steps += 1
+                    inner += 1
+                    s = real(1.0)
+                    descends = bool(False)
+                    halvings = int(0)
+                    while not descends and halvings < HALVINGS:
+                        trial = merit(c, slot, n, alpha, s, lane)
+                        if trial < (real(1.0) - real(1.0e-4) * s) * error:
+                            descends = True
+                            error = trial
+                            advance(c, slot, n, s, lane)
+                        else:
+                            s = real(0.5) * s
+                            halvings += 1
+                todo = 0
+                if not descends:
+                    alpha = wp.min(real(10.0) * alpha, real(1.0e3))
+                    todo = RESTART_SWEEPS
+                elif inner <= 6:
+                    alpha = wp.max(real(0.2) * alpha, alpha_least)
+                elif inner > 15:
+                    alpha = real(3.0) * alpha
+        for i in range(lane, n, wp.block_dim()):
+            c.impulse[slot, i] = c.best[slot, i]
+        sync()
         return wp.vec2i(status, steps)
 
     return SimpleNamespace(
