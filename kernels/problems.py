@@ -124,7 +124,7 @@ def make(real):
             wp.atomic_max(sizes, problem, 1, largest[1])
             analyse(g, slot, n, lane)  # there is room: the workspace is made for n
             load(g, c, slot, n, W, q, mu, directions, problem, lane)
-            result = proximal_newton(g, c, slot, n, real(0.01) * tolerance, sweeps, newton_limit, lane)
+            result = proximal_newton(g, c, slot, n, real(0.01) * tolerance, real(1.0e30), sweeps, newton_limit, lane)
             if lane == 0:
                 # Everything below from W, q, mu and p alone, with W as it was given.
                 worst = real(0.0)
@@ -238,6 +238,7 @@ def make_contacts(real):
         sweeps: int,
         limit: int,
         target: real,
+        rest: real,
         g: Graph,
         c: ContactProblem,
         iterations: wp.array(dtype=int),
@@ -276,7 +277,7 @@ def make_contacts(real):
                     c.directions[slot, i] = k
                     c.impulse[slot, i] = vec3()
                 sync()
-                result = proximal_newton(g, c, slot, n, target, sweeps, limit, lane)
+                result = proximal_newton(g, c, slot, n, target, rest, sweeps, limit, lane)
                 for i in range(lane, n, wp.block_dim()):
                     contacts.impulse[env, i] = c.impulse[slot, i]
                 if lane == 0:

@@ -114,8 +114,8 @@ class ProximalNewton:
         self.workspace = contact_workspace(sim.real, self.slots, n, blocks, fill, sim.device)
 
     def launch(self, sim: Simulator) -> None:
-        target = 1e-12 if sim.real is wp.float64 else 1e-6
-        inputs = [sim.bodies, sim.rows, sim.unsolved, self.SWEEPS, self.LIMIT, target, *self.workspace, sim.iterations, sim.reason]
+        accuracy = (1e-12, 1e-6) if sim.real is wp.float64 else (1e-6, 1e-2)  # of velocities, of impulses; relative
+        inputs = [sim.bodies, sim.rows, sim.unsolved, self.SWEEPS, self.LIMIT, *accuracy, *self.workspace, sim.iterations, sim.reason]
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
