@@ -156,7 +156,7 @@ def segment_functions(real) -> SimpleNamespace:
 
     @wp.func
     def bend(distance: real, n: vec3, closing: vec3, distance_ahead: real, n_ahead: vec3) -> real:
-        """How much more distance is left after free motion than distance + n . closing, the tangent plane's.
+        """How much more distance is left after a motion than distance + n . closing, the tangent plane's.
 
         What is left between the shapes as a whole counts, wherever it is. Nothing where the segment would meet or pass the
         other shape.
@@ -195,7 +195,11 @@ def make(real) -> dict:
 
     @wp.struct
     class Motion:
-        """Free motion of a capsule relative to the other shape over the step, world axes, and what it leads to."""
+        """Motion of a capsule relative to the other shape over a step at present velocities, world axes, and where it leads.
+
+        Present velocities, not free ones: what supports a rolling capsule takes the fall that free motion adds, and an edge
+        ahead must not take it too (3 % of the speed over six seams at 10 ms, 0.6 % so).
+        """
 
         middle: vec3  # of the segment, now
         shift: vec3  # h u of that point, m
@@ -210,15 +214,15 @@ def make(real) -> dict:
 
     @wp.func
     def relative_motion(topology: Topology, bodies: Bodies, env: int, a: int, b: int, middle: vec3, h: real) -> Motion:
-        """Free motion of shape b relative to shape a; what it leads to is left open."""
+        """Motion of shape b relative to shape a; where it leads is left open."""
         motion = Motion()
         motion.middle = middle
-        motion.shift = h * shape_velocity(topology, bodies, bodies.free_velocity, env, b, middle)
-        motion.shift -= h * shape_velocity(topology, bodies, bodies.free_velocity, env, a, middle)
+        motion.shift = h * shape_velocity(topology, bodies, bodies.velocity, env, b, middle)
+        motion.shift -= h * shape_velocity(topology, bodies, bodies.velocity, env, a, middle)
         if topology.shape_body[b] >= 0:
-            motion.turn += h * wp.spatial_bottom(bodies.free_velocity[env, topology.shape_body[b]])
+            motion.turn += h * wp.spatial_bottom(bodies.velocity[env, topology.shape_body[b]])
         if topology.shape_body[a] >= 0:
-            motion.turn -= h * wp.spatial_bottom(bodies.free_velocity[env, topology.shape_body[a]])
+            motion.turn -= h * wp.spatial_bottom(bodies.velocity[env, topology.shape_body[a]])
         return motion
 
     @wp.func
@@ -265,8 +269,8 @@ def make(real) -> dict:
             distance = wp.length(out)
             n = direction(out, distance, real(MEETS) * rb, perpendicular(axis))  # from the capsule to the sphere
             gap = distance - ra - rb
-            u = shape_velocity(topology, bodies, bodies.free_velocity, env, sa, centre)
-            u -= shape_velocity(topology, bodies, bodies.free_velocity, env, sb, centre)
+            u = shape_velocity(topology, bodies, bodies.velocity, env, sa, centre)
+            u -= shape_velocity(topology, bodies, bodies.velocity, env, sb, centre)
             ahead = outside_segment(p + h * u, axis, half)
             b = bend(distance, n, h * u, wp.length(ahead), ahead)
             write_bent(slots, env, topology.pair_slots[pair], centre - n * (ra + real(0.5) * gap), -n, gap, b, 0)
