@@ -572,7 +572,7 @@ def test_attributes_without_their_schema_are_reported():
 @pytest.mark.parametrize(
     ("scene", "parts"),
     [
-        ("no/such/file.usda", ["no/such/file.usda: no such file", "check the path"]),
+        ("no/such/thing.usda", ["no/such/thing.usda: no such file", "check the path"]),
         ("box_on_grond", ["box_on_grond: no file and no shipped scene", "did you mean the shipped scene 'box_on_ground'?", "stack"]),
         ("box_on_ground.usd", ["no such file", "'box_on_ground'"]),
         (Path("zzz"), ["zzz: no file and no shipped scene", "shipped: belt, box_on_ground"]),
@@ -648,7 +648,8 @@ def test_missing_extra(monkeypatch):
 def test_every_shipped_scene_says_what_it_shows_and_loads_without_remarks():
     from pxr import Sdf
 
-    assert set(scenes.names()) == {"belt", "box_on_ground", "heavy_on_light", "incline", "spinning_box", "sphere_slip_roll", "stack"}
+    boxes_and_balls = {"belt", "box_on_ground", "heavy_on_light", "incline", "spinning_box", "sphere_slip_roll", "stack"}
+    assert set(scenes.names()) == {"launch_fan", "pile", "plate_many_contacts", *boxes_and_balls}
     for name in scenes.names():
         root = Sdf.Layer.FindOrOpen(str(scenes.path(name)))
         assert "Expected:" in root.documentation
@@ -706,6 +707,23 @@ def test_spinning_box_sphere_and_belt():
     assert belt.shape_surface_velocity[static].tolist() == [1, 0, 0]
     assert not belt.v0.any()
     assert belt.q0[2] - 0.1 == pytest.approx(belt.shape_pose[static, 2] + belt.shape_size[static, 2], abs=1e-15)
+
+
+def test_launch_fan_pile_and_plates():
+    fan = wl.load_usd("launch_fan")
+    v = fan.v0.reshape(16, 6)
+    assert np.linalg.norm(v[:, :3], axis=1) == pytest.approx(np.full(16, 6), rel=1e-6)
+    assert np.degrees(np.arctan2(v[:, 1], v[:, 0])) == pytest.approx(np.arange(0, 91, 6), abs=1e-4)
+    assert (fan.q0.reshape(16, 7)[:, 3:] == (0, 0, 0, 1)).all()
+    plates = wl.load_usd("plate_many_contacts")
+    feet = np.bincount(plates.shape_body[plates.shape_type == ShapeType.SPHERE])
+    assert feet.tolist() == [4, 9, 16, 64]
+    assert np.ptp(plates.mass) == np.ptp(plates.com, axis=0).max() == np.ptp(plates.inertia, axis=0).max() == 0
+    assert plates.max_contacts >= feet.sum()
+    assert (plates.shape_body[plates.pairs] < 0).any(axis=1).all()  # plates pass through one another
+    pile = wl.load_usd("pile")
+    moving = pile.shape_type[pile.shape_body >= 0]
+    assert [np.count_nonzero(moving == kind) for kind in (ShapeType.BOX, ShapeType.SPHERE, ShapeType.CAPSULE)] == [4, 4, 4]
 
 
 # -- scenes of others -----------------------------------------------------------------------------------------------
