@@ -270,6 +270,26 @@ def test_axis_inside_a_box_leaves_by_the_shortest_way():
     assert ((gap[:, :2] < 1e29).all(1)).any()  # through a face
 
 
+@pytest.mark.parametrize("kind", ["edge of a box", "end of a capsule"])
+def test_crossing_an_edge_makes_one_point_there(kind):
+    """A capsule whose axis falls by 1 mrad to 0.5 rad beyond an edge: one point at the edge, its normal across the axis.
+
+    A second one with the normal of the face behind would stop what slides along the axis.
+    """
+    add = box() if kind == "edge of a box" else capsule(R2, BOX[0])
+    top = BOX[2] if kind == "edge of a box" else R2
+    tilts = np.concatenate([np.geomspace(1e-3, 0.5, 50), -np.geomspace(1e-3, 0.5, 50)])
+    q = np.zeros((len(tilts), 2, 7))
+    q[:, 0, 3:] = (0, 0, 0, 1) if kind == "edge of a box" else LYING
+    q[:, 1, 3:] = [(0, np.sin(np.pi / 4 + t / 2), 0, np.cos(np.pi / 4 + t / 2)) for t in tilts]
+    # The point of the axis over the edge, 5 cm from its middle, is R above it.
+    q[:, 1, :3] = [(np.sign(t) * (BOX[0] - 0.05), 0, top + (R + 1e-4 + 0.05 * np.abs(np.sin(t))) / np.cos(t)) for t in tilts]
+    point, normal, gap, _ = slots(pair(add, capsule()), q, np.tile(FAST, (len(q), 1)), dt=1e-2)
+    at_edge = (gap < 1e29) & (np.abs(np.abs(point[..., 0]) - BOX[0]) < 0.1)
+    assert (at_edge.sum(1) == 1).all()
+    assert np.einsum("eni,ei->en", normal, axes(q[:, 1]))[at_edge] == pytest.approx(np.zeros(len(q)), abs=1e-9)
+
+
 def moved(q: np.ndarray, v: np.ndarray, h: float) -> np.ndarray:
     """Poses [E, 2, 7] after h at constant velocities [E, 2, 6]; body frames are at the centres of mass."""
     q, angle = q.copy(), h * np.linalg.norm(v[..., 3:], axis=-1, keepdims=True)
