@@ -198,7 +198,7 @@ def make(real) -> dict:
         """Motion of a capsule relative to the other shape over a step at present velocities, world axes, and where it leads.
 
         Present velocities, not free ones: what supports a rolling capsule takes the fall that free motion adds, and an edge
-        ahead must not take it too (3 % of the speed over six seams at 10 ms, 0.6 % so).
+        ahead must not take it too (2.5 % of the speed over six seams at 10 ms, 0.4 % so).
         """
 
         middle: vec3  # of the segment, now
