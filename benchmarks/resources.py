@@ -45,6 +45,7 @@ def scenes() -> list[wl.Model]:
     for _ in range(2):
         many.add_box(many.add_body(), (0.1, 0.1, 0.1))
         many.add_sphere(many.add_body(), 0.1)
+        many.add_capsule(many.add_body(), 0.1, 0.1)
     return [single.finalize(), many.finalize()]
 
 

@@ -70,7 +70,7 @@ def scalar_types(real) -> SimpleNamespace:
         v_start: wp.array(dtype=int)  # [B]
         shape_body: wp.array(dtype=int)  # [S] -1 = world
         shape_pose: wp.array(dtype=transform)  # [S] in the body frame
-        shape_size: wp.array(dtype=vec3)  # [S] half extents | radius
+        shape_size: wp.array(dtype=vec3)  # [S] half extents | radius | capsule: radius, half length along z
         surface_velocity: wp.array(dtype=vec3)  # [S] shape frame, m/s
         pairs: wp.array2d(dtype=int)  # [P, 2]
         pair_slots: wp.array(dtype=int)  # [P + 1]
@@ -90,7 +90,7 @@ def scalar_types(real) -> SimpleNamespace:
         point: wp.array2d(dtype=vec3)  # [E, C] world
         normal: wp.array2d(dtype=vec3)  # [E, C] from shape a to shape b
         gap: wp.array2d(dtype=real)  # [E, C] phi, m; huge where there is no point
-        bend: wp.array2d(dtype=real)  # [E, C] how much more gap is left after free motion than phi + h u_n says, m
+        bend: wp.array2d(dtype=real)  # [E, C] how much more gap the motion ahead leaves than phi + h u_n says, m
         feature: wp.array2d(dtype=int)  # [E, C] which features touch
         # History, one step old:
         last_feature: wp.array2d(dtype=int)  # [E, C] -1 = was not in contact

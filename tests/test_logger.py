@@ -227,6 +227,30 @@ def test_ball_is_closed_and_turned_outwards():
     assert (np.einsum("ij,ij->i", a + b + c, np.cross(b - a, c - a)) > -1e-12).all()
 
 
+def test_capsules_are_drawn_about_their_middle(tmp_path):
+    """Rerun draws a capsule from z = 0 to its length: it is put back by half of that, so that the pose is that of the shape."""
+    half = np.sqrt(0.5)
+    builder = wl.ModelBuilder()
+    builder.add_plane()
+    body = builder.add_body("pill", pose=(0, 0, 0.2, 0, 0, 0, 1))
+    builder.add_capsule(body, 0.2, 0.3, pose=(0.1, 0, 0, 0, half, 0, half), name="pill")
+    builder.add_capsule(-1, 0.1, 2.0, pose=(3, 0, 0, 0, half, 0, half), name="rail")
+    path = tmp_path / "run.rrd"
+    _, logger, poses = simulate(path, builder.finalize(), frames=2, every=1)
+    for entity, length, radius in (("/world/bodies/pill", 0.6, 0.2), ("/world/static/rail", 4.0, 0.1)):
+        found = {c: read(path, entity, f"Capsules3D:{c}")[0][1] for c in ("lengths", "radii", "translations")}
+        assert found["lengths"] == pytest.approx([length])
+        assert found["radii"] == pytest.approx([radius])
+        np.testing.assert_allclose(found["translations"], [(0, 0, -length / 2)], atol=1e-6)
+    (_, at) = read(path, "/world/bodies/pill", "InstancePoses3D:translations")[-1]
+    np.testing.assert_allclose(at, poses[-1, :, 0, :3] + (0.1, 0, 0) + logger.layout.offsets, atol=1e-6)
+    (_, turned) = read(path, "/world/bodies/pill", "InstancePoses3D:quaternions")[-1]
+    np.testing.assert_allclose(rotate(turned.astype(float), np.array((0, 0, 1.0))), np.tile((1.0, 0, 0), (3, 1)), atol=1e-6)
+    # The room of an environment holds the rail to its end caps and the pill however it turns.
+    assert logger.layout.half[0] >= 0.5 * (3 + 2.1 - (0.1 - 0.5))
+    assert logger.layout.size == pytest.approx(1.0)
+
+
 def test_killed_process_leaves_its_frames(tmp_path):
     script = tmp_path / "run.py"
     script.write_text(

@@ -28,6 +28,22 @@ def test_mass_properties_follow_from_shapes():
     assert model.inertia[0] == pytest.approx(np.diag(expected), abs=1e-12)
 
 
+def test_a_capsule_is_solid():
+    """Volume and inertia against sums over 400 x 400 rings of its profile: the midpoint rule is good to 1e-5 here."""
+    radius, half, n = 0.3, 0.5, 400
+    builder = wl.ModelBuilder()
+    builder.add_capsule(builder.add_body(), radius, half, density=700)
+    model = builder.finalize()
+    z = (np.arange(n) + 0.5) / n * (half + radius)  # the upper half; the lower one is its mirror image
+    width = np.sqrt(radius**2 - np.maximum(z - half, 0) ** 2)
+    r = (np.arange(n)[:, None] + 0.5) / n * width
+    mass = 700 * 2 * (2 * np.pi * r) * (width / n) * (half + radius) / n
+    assert model.mass[0] == pytest.approx(mass.sum(), rel=1e-5)
+    across = (mass * (0.5 * r**2 + z**2)).sum()
+    assert model.inertia[0] == pytest.approx(np.diag([across, across, (mass * r**2).sum()]), rel=1e-5, abs=1e-12)
+    assert model.com[0] == pytest.approx(np.zeros(3), abs=1e-15)
+
+
 def test_explicit_mass_scales_the_inertia_and_explicit_inertia_wins():
     def box(**given):
         builder = wl.ModelBuilder()
@@ -67,13 +83,32 @@ def test_pairs_are_decided_at_load():
 
 
 def test_only_the_kernels_that_a_scene_needs():
-    """A box on a plane compiles no box against box, no sphere, and no solver for several bodies."""
+    """A box on a plane compiles no box against box, no sphere, no capsule, and no solver for several bodies."""
     from warp_lcp.simulator import kernel_names
 
     names = kernel_names(paper_box())
     assert "plane_box" in names
     assert "pivot_single" in names
     assert not {"box_box", "plane_sphere", "sphere_box", "sphere_sphere", "pivot"} & set(names)
+    assert not any("capsule" in name for name in names)
+
+
+def test_capsules_meet_every_shape():
+    """Pairs of a capsule put it second; each kind has its slots, and only kinds that are there get a kernel."""
+    from warp_lcp.simulator import kernel_names
+
+    builder = wl.ModelBuilder()
+    capsule = builder.add_capsule(builder.add_body(), 0.1, 0.2)
+    plane, box = builder.add_plane(), builder.add_box(-1, (1, 1, 1))
+    ball = builder.add_sphere(builder.add_body(), 0.1)
+    other = builder.add_capsule(-1, 0.1, 0.2)
+    builder.filter_pair(ball, plane)
+    builder.filter_pair(ball, box)
+    model = builder.finalize()
+    slots = dict(zip(map(tuple, model.pairs.tolist()), np.diff(model.pair_slots).tolist(), strict=True))
+    assert slots == {(plane, capsule): 2, (ball, capsule): 1, (ball, other): 1, (box, capsule): 3, (capsule, other): 3}
+    pairs = {"plane_capsule", "sphere_capsule", "box_capsule", "capsule_capsule"}
+    assert {name for name in kernel_names(model) if "capsule" in name or "sphere" in name or "box" in name} == pairs
 
 
 def test_a_model_cannot_be_changed():
@@ -97,6 +132,8 @@ def test_a_model_cannot_be_changed():
         (lambda b: b.add_box(0, (1, 1, 1)), "body 0 does not exist"),
         (lambda b: b.add_box(-1, (1, 1)), "half_extents has 2 numbers; give 3"),
         (lambda b: b.add_sphere(-1, -1.0), "sphere: radius is -1.0 m"),
+        (lambda b: b.add_capsule(-1, 0.0, 1.0), "capsule: radius is 0.0 m"),
+        (lambda b: b.add_capsule(-1, 1.0, np.inf), "capsule: half length is inf m"),
         (lambda b: b.add_plane(b.add_body("a")), "a plane is infinite and cannot move freely"),
         (lambda b: b.add_box(-1, (1, 1, 1), material=wl.Material(0.1, 0.5)), "dynamic friction 0.5 exceeds static friction 0.1"),
         (lambda b: b.add_box(-1, (1, 1, 1), material=wl.Material(normal_damping=0.0)), "normal_damping is 0.0"),

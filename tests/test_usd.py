@@ -234,7 +234,6 @@ def test_unusable_mass_is_refused_by_name(content, inner, what):
 
 def test_total_mass_of_shapes_that_are_not_simulated_yet():
     shapes = {
-        "Capsule": ("double radius = 0.5; double height = 2;", math.pi * 0.25 * 2 + 4 / 3 * math.pi * 0.125),
         "Cylinder": ("double radius = 0.5; double height = 2;", math.pi * 0.25 * 2),
         "Cone": ("double radius = 0.5; double height = 2;", math.pi * 0.25 * 2 / 3),
     }
@@ -272,12 +271,46 @@ def test_mirrored_transforms_keep_proper_rotations():
     assert normal == pytest.approx([-1, 0, 0], abs=1e-12)  # +x, mirrored
 
 
-def test_sheared_cube_and_ellipsoid_are_refused():
+def test_sheared_cube_and_ellipsoids_are_refused():
     slanted = prim("Xform", "X", (), xform(scale="(1, 2, 1)") + cube("C", xform(rotateZ=30)))
     egg = prim("Sphere", "Egg", (COLLIDER,), xform(scale="(1, 1, 1.5)"))
-    message = refused(body(), slanted, egg)
+    pill = prim("Capsule", "Pill", (COLLIDER,), xform(scale="(1, 1, 1.5)"))
+    message = refused(body(), slanted, egg, pill)
     assert "sheared Cube collider /X/C" in message
     assert "ellipsoid /Egg" in message
+    assert "Capsule collider with ends scaled to ellipsoids /Pill" in message
+
+
+@pytest.mark.parametrize(("axis", "along"), [("X", (0, 1, 0)), ("Y", (-1, 0, 0)), ("Z", (0, 0, 1))])
+def test_capsule_along_any_axis(axis, along):
+    """Its axis becomes local z; turned by 90 degrees about z by the prim, twice as large, in centimetres; 1000 kg/m^3."""
+    content = f'double radius = 10; double height = 60; uniform token axis = "{axis}"; vector3f warpLcp:surfaceVelocity = (100, 0, 0);'
+    inner = prim("Capsule", "C", (COLLIDER,), content + xform(translate="(5, 0, 0)", rotateZ=90, scale="(2, 2, 2)"))
+    model = load(body(inner=inner), head=CM)
+    assert model.shape_type.tolist() == [ShapeType.CAPSULE]
+    assert model.shape_size[0] == pytest.approx([0.2, 0.6, 0])
+    rotation = wl.builder.rotation_matrix(model.shape_pose[0, 3:])
+    assert rotation[:, 2] == pytest.approx(along, abs=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    assert rotation @ model.shape_surface_velocity[0] == pytest.approx([0, 1, 0], abs=1e-12)
+    rod, ball = 1000 * math.pi * 0.04 * 1.2, 1000 * 4 / 3 * math.pi * 0.008
+    assert model.mass == pytest.approx([rod + ball], rel=1e-6)
+    assert model.com[0] == pytest.approx([0.05, 0, 0], abs=1e-9)
+    spin = rod * 0.04 / 2 + ball * 0.4 * 0.04
+    across = rod * (0.04 / 4 + 1.2**2 / 12) + ball * (0.4 * 0.04 + 0.6**2 + 0.75 * 0.6 * 0.2)
+    expected = np.where(np.abs(along), spin, across)
+    assert model.inertia[0] == pytest.approx(np.diag(expected), rel=1e-6, abs=1e-6 * across)
+
+
+def test_capsule_defaults_are_those_of_usd_and_a_density_counts():
+    """radius 0.5, height 1, axis Z; as part of a compound the mass comes by way of ComputeMassProperties, single precision."""
+    inner = prim("Capsule", "C", (COLLIDER, MASS), "float physics:density = 500;") + cube("D", xform(translate="(3, 0, 0)"))
+    model = load(body(inner=inner))
+    volume = math.pi * 0.25 + 4 / 3 * math.pi * 0.125
+    assert model.shape_size[0].tolist() == [0.5, 0.5, 0]
+    assert model.mass == pytest.approx([500 * volume + 1000], rel=1e-6)
+    assert model.com[0] == pytest.approx([3000 / (500 * volume + 1000), 0, 0], rel=1e-6)
+    assert "/B/C: capsule: half length is 0.0 m" in refused(body(inner=prim("Capsule", "C", (COLLIDER,), "double height = 0;")))
 
 
 def test_velocities_are_along_the_body_and_of_its_centre_of_mass():
@@ -492,12 +525,12 @@ def test_unknown_joint_type_collider_on_xform_and_bare_articulation_root():
 
 
 def test_unsupported_shapes_are_all_named():
-    others = [prim(kind, kind, (COLLIDER,)) for kind in ("Capsule", "Cylinder", "Cone", "Mesh", "Capsule_1")]
+    others = [prim(kind, kind, (COLLIDER,)) for kind in ("Cylinder", "Cone", "Mesh", "Capsule_1")]
     plane = body("Flying", inner=prim("Plane", "P", (COLLIDER,)) + cube())
     off = prim("Cone", "Off", (COLLIDER,), "bool physics:collisionEnabled = 0;")
     message = refused(plane, *others, off)
     assert "Plane collider /Flying/P: a plane is infinite" in message
-    for kind in ("Capsule", "Cylinder", "Cone", "Mesh", "Capsule_1"):
+    for kind in ("Cylinder", "Cone", "Mesh", "Capsule_1"):
         assert f"{kind} collider /{kind}" in message
     assert "/Off" not in message
 
@@ -539,7 +572,7 @@ def test_attributes_without_their_schema_are_reported():
 @pytest.mark.parametrize(
     ("scene", "parts"),
     [
-        ("no/such/file.usda", ["no/such/file.usda: no such file", "check the path"]),
+        ("no/such/thing.usda", ["no/such/thing.usda: no such file", "check the path"]),
         ("box_on_grond", ["box_on_grond: no file and no shipped scene", "did you mean the shipped scene 'box_on_ground'?", "stack"]),
         ("box_on_ground.usd", ["no such file", "'box_on_ground'"]),
         (Path("zzz"), ["zzz: no file and no shipped scene", "shipped: belt, box_on_ground"]),
@@ -615,7 +648,8 @@ def test_missing_extra(monkeypatch):
 def test_every_shipped_scene_says_what_it_shows_and_loads_without_remarks():
     from pxr import Sdf
 
-    assert set(scenes.names()) == {"belt", "box_on_ground", "heavy_on_light", "incline", "spinning_box", "sphere_slip_roll", "stack"}
+    boxes_and_balls = {"belt", "box_on_ground", "heavy_on_light", "incline", "spinning_box", "sphere_slip_roll", "stack"}
+    assert set(scenes.names()) == {"launch_fan", "pile", "plate_many_contacts", *boxes_and_balls}
     for name in scenes.names():
         root = Sdf.Layer.FindOrOpen(str(scenes.path(name)))
         assert "Expected:" in root.documentation
@@ -675,6 +709,23 @@ def test_spinning_box_sphere_and_belt():
     assert belt.q0[2] - 0.1 == pytest.approx(belt.shape_pose[static, 2] + belt.shape_size[static, 2], abs=1e-15)
 
 
+def test_launch_fan_pile_and_plates():
+    fan = wl.load_usd("launch_fan")
+    v = fan.v0.reshape(16, 6)
+    assert np.linalg.norm(v[:, :3], axis=1) == pytest.approx(np.full(16, 6), rel=1e-6)
+    assert np.degrees(np.arctan2(v[:, 1], v[:, 0])) == pytest.approx(np.arange(0, 91, 6), abs=1e-4)
+    assert (fan.q0.reshape(16, 7)[:, 3:] == (0, 0, 0, 1)).all()
+    plates = wl.load_usd("plate_many_contacts")
+    feet = np.bincount(plates.shape_body[plates.shape_type == ShapeType.SPHERE])
+    assert feet.tolist() == [4, 9, 16, 64]
+    assert np.ptp(plates.mass) == np.ptp(plates.com, axis=0).max() == np.ptp(plates.inertia, axis=0).max() == 0
+    assert plates.max_contacts >= feet.sum()
+    assert (plates.shape_body[plates.pairs] < 0).any(axis=1).all()  # plates pass through one another
+    pile = wl.load_usd("pile")
+    moving = pile.shape_type[pile.shape_body >= 0]
+    assert [np.count_nonzero(moving == kind) for kind in (ShapeType.BOX, ShapeType.SPHERE, ShapeType.CAPSULE)] == [4, 4, 4]
+
+
 # -- scenes of others -----------------------------------------------------------------------------------------------
 
 #: Files that can be simulated: bodies, mass [kg], pairs.
@@ -682,6 +733,7 @@ LOADED = {
     "converted/muc_contact_excludes/contact_excludes.usdc": (4, 108.0, 7),
     "newton/ex_palletizer_scene.usda": (7, 102.0, 35),
     "newton/kamino_box_on_plane.usda": (1, 1.0, 1),
+    "newton/test_geom_capsule.usda": (1, 1.0, 0),
     "openusd/usdPhysicsBoxOnBox.usda": (1, 15.625, 1),
     "openusd/usdPhysicsDistanceJoint.usda": (1, 10.0, 1),
     "openusd/usdPhysicsGroupFiltering.usda": (2, 31.25, 2),
@@ -708,7 +760,7 @@ def refusable(path):
     for p in Usd.PrimRange.Stage(source, Usd.TraverseInstanceProxies()):
         collider = p.HasAPI(UsdPhysics.CollisionAPI) and p.IsA(UsdGeom.Gprim)
         body_above = next((a for a in chain(p) if a.HasAPI(UsdPhysics.RigidBodyAPI)), None)
-        odd_shape = collider and (p.GetTypeName() not in ("Cube", "Sphere", "Plane") or "ellipsoid" in p.GetName())
+        odd_shape = collider and (p.GetTypeName() not in ("Cube", "Sphere", "Plane", "Capsule") or "ellipsoid" in p.GetName())
         flying_plane = collider and p.GetTypeName() == "Plane" and body_above
         massless = p.HasAPI(UsdPhysics.RigidBodyAPI) and not massive(p)
         if p.IsA(UsdPhysics.Joint) or odd_shape or flying_plane or massless:

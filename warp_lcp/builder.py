@@ -53,6 +53,8 @@ class _Shape:
     def volume(self) -> float:
         if self.type is ShapeType.BOX:
             return 8.0 * float(np.prod(self.size))
+        if self.type is ShapeType.CAPSULE:
+            return capsule_solid(*self.size[:2])[0]
         return 4.0 / 3.0 * np.pi * float(self.size[0]) ** 3
 
     def unit_inertia(self) -> np.ndarray:
@@ -60,7 +62,18 @@ class _Shape:
         if self.type is ShapeType.BOX:
             s = self.size**2
             return np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) / 3.0
+        if self.type is ShapeType.CAPSULE:
+            _, along, across = capsule_solid(*self.size[:2])
+            return np.diag([across, across, along])
         return np.eye(3) * 0.4 * self.size[0] ** 2
+
+
+def capsule_solid(r: float, h: float) -> tuple[float, float, float]:
+    """Volume, and inertia per unit mass along and across the axis, of a capsule with radius r and straight part of 2 h."""
+    rod, ball = 2.0 * np.pi * r**2 * h, 4.0 / 3.0 * np.pi * r**3
+    along = 0.5 * rod + 0.4 * ball
+    across = rod * (0.25 * r**2 + h**2 / 3.0) + ball * (0.4 * r**2 + h**2 + 0.75 * h * r)
+    return rod + ball, along * r**2 / (rod + ball), across / (rod + ball)
 
 
 def compose_mass(parts: Sequence[tuple[float, np.ndarray, np.ndarray]]) -> tuple[float, np.ndarray, np.ndarray]:
@@ -146,6 +159,18 @@ class ModelBuilder:
         """Add a sphere of the given radius [m]; ``options`` as for :meth:`add_box`. Returns the shape's index."""
         radius = _positive("sphere: radius", radius, "m")
         return self._add_shape(ShapeType.SPHERE, body, pose, np.array([radius, 0.0, 0.0]), **options)
+
+    def add_capsule(self, body: int, radius: float, half_length: float, *, pose: Sequence[float] = IDENTITY, **options) -> int:
+        """Add a capsule along the shape's z axis; ``options`` as for :meth:`add_box`. Returns the shape's index.
+
+        Args:
+            body: owner; -1 = world.
+            radius: [m].
+            half_length: half the length of the straight part [m]; the whole capsule is 2 (half_length + radius) long.
+            pose: in the owner's frame.
+        """
+        size = [_positive("capsule: radius", radius, "m"), _positive("capsule: half length", half_length, "m"), 0.0]
+        return self._add_shape(ShapeType.CAPSULE, body, pose, np.array(size), **options)
 
     def add_box(
         self,

@@ -85,7 +85,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is drawn for each of S shapes: [S, 7] pose in the body's frame, [S, 3] half extents."""
+    """What is drawn for each of S shapes: [S, 7] pose in the body's frame, [S, 3] half extents (of a capsule: its size)."""
 
     pose: np.ndarray
     half: np.ndarray
@@ -303,8 +303,11 @@ class RerunLogger:
             vertices, triangles, light = ball(half[0])
             colors = np.where(light[:, None], np.array(color), np.array(color) * 0.55).astype(np.uint8)
             return rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_normals=vertices / half[0], vertex_colors=colors)
-        clear = kind == ShapeType.BOX and shape in self._moving  # the forces on it start inside
+        clear = kind in (ShapeType.BOX, ShapeType.CAPSULE) and shape in self._moving  # the forces on it start inside
         mode = rr.components.FillMode.TransparentFillMajorWireframe if clear else rr.components.FillMode.Solid
+        if kind == ShapeType.CAPSULE:  # Rerun's own start at z = 0
+            at = [(0.0, 0.0, -half[1])]
+            return rr.Capsules3D(lengths=[2.0 * half[1]], radii=[half[0]], translations=at, colors=[color], fill_mode=mode)
         return rr.Boxes3D(half_sizes=[half], colors=[color], fill_mode=mode)
 
     def _open(self, sink: str | os.PathLike[str]) -> str:
@@ -455,6 +458,9 @@ def lay_out(model: Model, pose: np.ndarray, velocity: np.ndarray, moving: Sequen
     where = shape_poses(model, pose, model.shape_pose, shapes)
     half, turns = model.shape_size[shapes], np.isin(shapes, moving)
     around = np.linalg.norm(half, axis=-1)  # radius of the bounding sphere: a sphere has its radius alone there
+    long = model.shape_type[shapes] == ShapeType.CAPSULE
+    around = np.where(long, half[:, 0] + half[:, 1], around)
+    half = np.where(long[:, None], np.stack([half[:, 0], half[:, 0], around], axis=-1), half)
     size = 2.0 * float(np.median(around[turns])) if turns.any() else 1.0
     axes = np.stack([rotate(where[..., 3:], half[:, i, None] * np.eye(3)[i]) for i in range(3)])
     whole = turns | (model.shape_type[shapes] == ShapeType.SPHERE)

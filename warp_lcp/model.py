@@ -37,6 +37,7 @@ class ShapeType(enum.IntEnum):
     PLANE = 0
     SPHERE = 1
     BOX = 2
+    CAPSULE = 3
 
 
 #: Contact points that a pair of shapes can make, by (lower type, higher type); pairs not listed never touch.
@@ -46,6 +47,10 @@ CONTACT_POINTS: dict[tuple[ShapeType, ShapeType], int] = {
     (ShapeType.SPHERE, ShapeType.SPHERE): 1,
     (ShapeType.SPHERE, ShapeType.BOX): 1,
     (ShapeType.BOX, ShapeType.BOX): 8,
+    (ShapeType.PLANE, ShapeType.CAPSULE): 2,
+    (ShapeType.SPHERE, ShapeType.CAPSULE): 1,
+    (ShapeType.BOX, ShapeType.CAPSULE): 3,
+    (ShapeType.CAPSULE, ShapeType.CAPSULE): 3,
 }
 
 #: Contact parameters of Table 1 for a body of 1 kg; an unauthored parameter is this times the mass of the lighter
@@ -126,7 +131,8 @@ class Model:
         inertia: [B, 3, 3] about the centre of mass, body axes, kg m^2.
         shape_names, shape_type, shape_body: [S] name, :class:`ShapeType` and owner (-1 = world).
         shape_pose: [S, 7] pose in the owner's frame.
-        shape_size: [S, 3] metres; box: half extents, sphere: radius in [0], plane: unused (normal = local +z).
+        shape_size: [S, 3] metres; box: half extents, sphere: radius in [0], capsule: radius in [0], half the length of its
+            straight part, which lies along local z, in [1]; plane: unused (normal = local +z).
         shape_surface_velocity: [S, 3] m/s in the shape's frame, velocity of the surface relative to the body (belts).
         friction: [S, 2] static and dynamic coefficient.
         contact: [S, 5] k_n, b_n, k_t, b_t, v_s; NaN where the defaults of Table 1 apply.

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from .errors import SimulationError, WarpLcpError
-from .kernels import bodies, box_box, certify, collide, contacts, reset
+from .kernels import bodies, box_box, capsule, certify, collide, contacts, reset
 from .kernels.types import scalar_types
 from .methods import METHODS, chosen
 from .model import Model, ShapeType
@@ -401,7 +401,8 @@ def stage_kernels(model: Model, real: Any) -> tuple[SimpleNamespace, list[tuple[
     kinds = [tuple(ShapeType(model.shape_type[s]).name for s in pair) for pair in model.pairs]
     pairs = []
     for kind in dict.fromkeys(kinds):
-        kernel = box_box.make(real) if kind == ("BOX", "BOX") else collide.make(real)[kind]
+        by_kind = capsule.make(real) if "CAPSULE" in kind else collide.make(real)
+        kernel = box_box.make(real) if kind == ("BOX", "BOX") else by_kind[kind]
         pairs.append((kernel, kinds.index(kind), kinds.count(kind)))
     return stages, pairs
 

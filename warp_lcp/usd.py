@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-from .builder import ModelBuilder, rotation_matrix
+from .builder import ModelBuilder, capsule_solid, rotation_matrix
 from .errors import MissingExtra, ModelError, SceneError
 from .model import Ignored, JointType, Material, Model, Report
 
@@ -556,10 +556,7 @@ class _Reader:
         r, h, centre = float(desc.radius), float(desc.halfHeight), np.zeros(3)  # h: half the height of the straight part
         axis = "XYZ".index(str(desc.axis).rpartition(".")[2])
         if kind == "CapsuleShape":
-            rod, ball = 2.0 * math.pi * r**2 * h, 4.0 / 3.0 * math.pi * r**3
-            volume = rod + ball
-            along = (0.5 * rod + 0.4 * ball) * r**2 / volume
-            across = (rod * (r**2 / 4 + h**2 / 3) + ball * (0.4 * r**2 + h**2 + 0.75 * h * r)) / volume
+            volume, along, across = capsule_solid(r, h)
         elif kind == "CylinderShape":
             volume, along, across = 2.0 * math.pi * r**2 * h, r**2 / 2, r**2 / 4 + h**2 / 3
         else:
@@ -575,6 +572,11 @@ class _Reader:
     def _radius(self, prim: Any) -> float:
         return float(self.px.UsdGeom.Sphere(prim).GetRadiusAttr().Get())
 
+    def _capsule(self, prim: Any, frame: _Frame) -> tuple[float, float]:
+        """Radius and half the length of the straight part."""
+        api, scale = self.px.UsdGeom.Capsule(prim), frame.scale.max()
+        return float(api.GetRadiusAttr().Get()) * scale, 0.5 * float(api.GetHeightAttr().Get()) * scale
+
     def _shape(self, path: Any, desc: Any) -> None:
         prim, frame, owner = self.stage.GetPrimAtPath(path), self._frame(path), desc.rigidBody
         problem = self._shape_problem(prim, desc, frame)
@@ -585,7 +587,12 @@ class _Reader:
             return  # refused with its body
         body = self.bodies[owner] if owner else None
         index, kind = -1 if body is None else body.index, str(desc.type).rpartition(".")[2]
-        rotation = self._plane_rotation(prim, frame) if kind == "PlaneShape" else frame.rotation
+        if kind == "PlaneShape":
+            rotation = self._plane_rotation(prim, frame)
+        elif kind == "CapsuleShape":  # the prim's axis becomes the shape's z
+            rotation = np.roll(frame.rotation, 2 - "XYZ".index(str(self.px.UsdGeom.Capsule(prim).GetAxisAttr().Get())), axis=1)
+        else:
+            rotation = frame.rotation
         options: dict[str, Any] = {
             "pose": self._pose(frame, None if body is None else body.frame, rotation),
             "name": str(path),
@@ -597,6 +604,9 @@ class _Reader:
                 shape = self.builder.add_plane(index, **options)
             elif kind == "SphereShape":
                 shape = self.builder.add_sphere(index, self.length * self._radius(prim) * frame.scale.max(), **options)
+            elif kind == "CapsuleShape":
+                radius, half_length = self._capsule(prim, frame)
+                shape = self.builder.add_capsule(index, self.length * radius, self.length * half_length, **options)
             else:
                 shape = self.builder.add_box(index, (self.length * self._half_extents(prim, frame)).tolist(), **options)
         except ModelError as error:
@@ -607,14 +617,15 @@ class _Reader:
     def _shape_problem(self, prim: Any, desc: Any, frame: _Frame) -> tuple[str, str] | None:
         """(what, why) where a collider cannot be simulated."""
         name, kind = f"{prim.GetTypeName()} collider", str(desc.type).rpartition(".")[2]
-        if kind not in ("CubeShape", "SphereShape", "PlaneShape"):
-            return name, "this shape is not supported yet; use Plane, Sphere or Cube, or set physics:collisionEnabled = false"
+        if kind not in ("CubeShape", "SphereShape", "CapsuleShape", "PlaneShape"):
+            return name, "this shape is not supported yet; use Plane, Sphere, Capsule or Cube, or set physics:collisionEnabled = false"
         owner = self.body_descs.get(desc.rigidBody) if desc.rigidBody else None
         if kind == "PlaneShape" and owner is not None and not owner.kinematicBody:
             return name, "a plane is infinite and cannot move freely; make it static or its body kinematic"
         stretch = frame.stretch
-        if kind == "SphereShape" and stretch[0] - stretch[2] > _UNIFORM * stretch[0]:
-            return "Sphere collider scaled to an ellipsoid", "this shape is not supported yet; scale all axes alike"
+        if kind in ("SphereShape", "CapsuleShape") and stretch[0] - stretch[2] > _UNIFORM * stretch[0]:
+            what = "Sphere collider scaled to an ellipsoid" if kind == "SphereShape" else "Capsule collider with ends scaled to ellipsoids"
+            return what, "this shape is not supported yet; scale all axes alike"
         if kind == "CubeShape" and frame.sheared:
             return "sheared Cube collider", "a rotation under a non-uniform scale slants it; put the scale on the Cube itself"
         return None
@@ -790,7 +801,7 @@ class _Reader:
         if path in self.colliders or not prim.HasAPI(api) or not api(prim).GetCollisionEnabledAttr().Get():
             return
         if prim.IsA(self.px.UsdGeom.Gprim):
-            why = "UsdPhysics has no collider of this type; use Plane, Sphere or Cube"
+            why = "UsdPhysics has no collider of this type; use Plane, Sphere, Capsule or Cube"
             self.unsupported.append(Ignored(str(path), f"{type_name} collider", why))
         else:
             what = f"PhysicsCollisionAPI on {type_name or 'an untyped prim'}"

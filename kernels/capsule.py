@@ -1,0 +1,499 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gap functions of capsules: spheres of radius r swept along a segment, |t| <= half on the shape's z axis; size = (r, half, 0).
+
+A capsule touches where its segment is nearest to the other shape. Where the segment runs along that shape (a face, an edge,
+the side of another capsule) the nearest point is any of a stretch, or jumps from one end of it to the other with the last
+bits; so both ends of the stretch get a point each, which is what a capsule rests on without rocking. Slots of a pair:
+
+====================  =======================================================================================
+plane - capsule       0, 1: the ends at t = -half and half
+sphere - capsule      0: the nearest point
+box - capsule,        0, 1: the lower and the upper end of the stretch; feature: what ends it, the capsule (0) or a side
+capsule - capsule     of the other shape; 2: the nearest point, where it is nearer than both ends (covered_within)
+====================  =======================================================================================
+"""
+
+import functools
+from types import SimpleNamespace
+
+import warp as wp
+
+from .collide import NO_POINT, pair_functions
+from .types import scalar_types
+
+# Of the radius: a segment that strays from a side by less than this runs along it. The distance it misses is the square
+# of it over twice the radius, less than what "covered" allows.
+ALONG = wp.constant(1.0e-4)
+# Of the radius: a segment closer than this to the other shape has no direction of its own to it.
+MEETS = wp.constant(1.0e-4)
+
+
+def covered_within(real) -> float:
+    """Of the radius: an end of a stretch this close to the least distance stands for the nearest point.
+
+    What it misses grows with the square of the tilt: above the static deflections of a capsule at rest, which must not change
+    its points, and above round-off; below a tilt of 0.14 mrad in float64, 4 mrad in float32.
+    """
+    return 1.0e-8 if real is wp.float64 else 1.0e-5
+
+
+@functools.cache
+def segment_functions(real) -> SimpleNamespace:
+    """Points of a segment c + t e, |t| <= half, e a unit vector, that are nearest to other shapes."""
+    t = scalar_types(real)
+    vec3 = t.vec3
+
+    @wp.struct
+    class Stretch:
+        """Part of a segment that runs along another shape."""
+
+        low: real  # parameters of its ends, m from the middle of the segment; low > high: there is none
+        high: real
+        low_end: int  # what ends it: 0 = the segment itself, 1 + 2 m = the lower side of direction m, 2 + 2 m = its upper side
+        high_end: int
+
+    @wp.func
+    def whole(half: real) -> Stretch:
+        s = Stretch()
+        s.low = -half
+        s.high = half
+        return s
+
+    @wp.func
+    def cut(s: Stretch, c: real, e: real, half: real, wide: real, m: int, slack: real) -> Stretch:
+        """Keep what lies between the sides -wide and wide of direction m, in which the segment is at c + t e."""
+        if wp.abs(e) * half <= slack:
+            if wp.abs(c) > wide + slack:
+                s.high = s.low - real(1.0)
+        else:
+            first = (-wide - c) / e
+            last = (wide - c) / e
+            first_end = 1 + 2 * m
+            last_end = 2 + 2 * m
+            if e < real(0.0):
+                first = (wide - c) / e
+                last = (-wide - c) / e
+                first_end = 2 + 2 * m
+                last_end = 1 + 2 * m
+            # An end that lies on the side keeps its identity, whatever the last bits say.
+            if first > s.low + real(1.0e-4) * half:
+                s.low = first
+                s.low_end = first_end
+            if last < s.high - real(1.0e-4) * half:
+                s.high = last
+                s.high_end = last_end
+        return s
+
+    @wp.func
+    def outside_box(p: vec3, size: vec3) -> vec3:
+        """From the nearest point of a box to p, in the frame of the box; zero inside."""
+        return p - vec3(wp.clamp(p[0], -size[0], size[0]), wp.clamp(p[1], -size[1], size[1]), wp.clamp(p[2], -size[2], size[2]))
+
+    @wp.func
+    def nearest_to_box(c: vec3, e: vec3, half: real, size: vec3) -> real:
+        """Parameter of the point nearest to a box, in the frame of the box.
+
+        The slope of half the squared distance, e . outside(t), never falls and is straight between the planes of the sides:
+        bisect over these planes, then interpolate.
+        """
+        low = -half
+        high = half
+        slope_low = wp.dot(e, outside_box(c - half * e, size))
+        slope_high = wp.dot(e, outside_box(c + half * e, size))
+        result = low
+        if slope_low < real(0.0):
+            result = high
+            if slope_high > real(0.0):
+                for k in range(6):
+                    m = k // 2
+                    if e[m] != real(0.0):
+                        at = (real(2 * (k % 2) - 1) * size[m] - c[m]) / e[m]
+                        if at > low and at < high:
+                            slope = wp.dot(e, outside_box(c + at * e, size))
+                            if slope < real(0.0):
+                                low = at
+                                slope_low = slope
+                            else:
+                                high = at
+                                slope_high = slope
+                result = low + (high - low) * slope_low / (slope_low - slope_high)
+        return result
+
+    @wp.func
+    def outside_segment(p: vec3, e: vec3, half: real) -> vec3:
+        """From the nearest point of a segment about the origin to p."""
+        return p - e * wp.clamp(wp.dot(p, e), -half, half)
+
+    @wp.func
+    def nearest_to_segment(c: vec3, e: vec3, half: real, axis: vec3, other: real) -> real:
+        """Parameter of the point nearest to the segment s axis, |s| <= other, about the origin."""
+        across = wp.cross(axis, e)
+        sine = wp.length_sq(across)
+        s = real(0.0)
+        if sine > real(0.0):
+            s = wp.clamp(wp.dot(c, wp.cross(e, across)) / sine, -other, other)
+        at = wp.clamp(wp.dot(axis * s - c, e), -half, half)
+        s = wp.clamp(wp.dot(c + at * e, axis), -other, other)
+        return wp.clamp(wp.dot(axis * s - c, e), -half, half)
+
+    @wp.func
+    def perpendicular(e: vec3) -> vec3:
+        """Some unit vector across e."""
+        k = int(0)
+        for m in range(1, 3):
+            if wp.abs(e[m]) < wp.abs(e[k]):
+                k = m
+        other = vec3()
+        other[k] = real(1.0)
+        return wp.normalize(wp.cross(e, other))
+
+    @wp.func
+    def direction(out: vec3, distance: real, least: real, otherwise: vec3) -> vec3:
+        n = otherwise
+        if distance > least:
+            n = out / distance
+        return n
+
+    @wp.func
+    def bend(distance: real, n: vec3, closing: vec3, distance_ahead: real, n_ahead: vec3) -> real:
+        """How much more distance is left after a motion than distance + n . closing, the tangent plane's.
+
+        What is left between the shapes as a whole counts, wherever it is. Nothing where the segment would meet or pass the
+        other shape.
+        """
+        result = real(0.0)
+        if distance_ahead > real(0.0) and wp.dot(n, n_ahead) > real(0.0):
+            result = wp.max(distance_ahead - distance - wp.dot(n, closing), real(0.0))
+        return result
+
+    return SimpleNamespace(
+        Stretch=Stretch,
+        whole=whole,
+        cut=cut,
+        outside_box=outside_box,
+        nearest_to_box=nearest_to_box,
+        outside_segment=outside_segment,
+        nearest_to_segment=nearest_to_segment,
+        perpendicular=perpendicular,
+        direction=direction,
+        bend=bend,
+    )
+
+
+@functools.cache
+def make(real) -> dict:
+    """Kernels by the names of the two shape types; launch with dim (E, pairs of that kind), as those of ``collide``."""
+    t = scalar_types(real)
+    vec3, transform = t.vec3, t.transform
+    Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
+    f, g = pair_functions(real), segment_functions(real)
+    shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
+    whole, cut, direction, perpendicular, bend = g.whole, g.cut, g.direction, g.perpendicular, g.bend
+    outside_box, nearest_to_box = g.outside_box, g.nearest_to_box
+    outside_segment, nearest_to_segment = g.outside_segment, g.nearest_to_segment
+    covered_part = wp.constant(covered_within(real))
+
+    @wp.struct
+    class Motion:
+        """Motion of a capsule relative to the other shape over a step at present velocities, world axes, and where it leads.
+
+        Present velocities, not free ones: what supports a rolling capsule takes the fall that free motion adds, and an edge
+        ahead must not take it too (2.5 % of the speed over six seams at 10 ms, 0.4 % so).
+        """
+
+        middle: vec3  # of the segment, now
+        shift: vec3  # h u of that point, m
+        turn: vec3  # h w, rad
+        distance: real  # of the segment from the other shape, then
+        normal: vec3  # towards the segment, then; of any length
+        near: real  # what is further away than this gets no row
+
+    @wp.func
+    def z_axis(pose: transform) -> vec3:
+        return wp.transform_vector(pose, vec3(real(0.0), real(0.0), real(1.0)))
+
+    @wp.func
+    def relative_motion(topology: Topology, bodies: Bodies, env: int, a: int, b: int, middle: vec3, h: real) -> Motion:
+        """Motion of shape b relative to shape a; where it leads is left open."""
+        motion = Motion()
+        motion.middle = middle
+        motion.shift = h * shape_velocity(topology, bodies, bodies.velocity, env, b, middle)
+        motion.shift -= h * shape_velocity(topology, bodies, bodies.velocity, env, a, middle)
+        if topology.shape_body[b] >= 0:
+            motion.turn += h * wp.spatial_bottom(bodies.velocity[env, topology.shape_body[b]])
+        if topology.shape_body[a] >= 0:
+            motion.turn -= h * wp.spatial_bottom(bodies.velocity[env, topology.shape_body[a]])
+        return motion
+
+    @wp.func
+    def write_near(
+        slots: Slots, env: int, slot: int, motion: Motion, p: vec3, n: vec3, distance: real, radii: real, radius: real, feature: int
+    ):
+        """A point of the segment, p in the world, at a distance along n from the other shape; radii: of both together."""
+        gap = distance - radii
+        if gap < motion.near:
+            closing = motion.shift + wp.cross(motion.turn, p - motion.middle)
+            b = bend(distance, n, closing, motion.distance, motion.normal)
+            write_bent(slots, env, slot, p - n * (radius + real(0.5) * gap), n, gap, b, feature)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def plane_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+        start, i = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            pair = first + i
+            plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
+            capsule = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
+            size = topology.shape_size[topology.pairs[pair, 1]]
+            normal = z_axis(plane)
+            for k in range(2):
+                centre = wp.transform_point(capsule, vec3(real(0.0), real(0.0), real(2 * k - 1) * size[1]))
+                gap = wp.dot(normal, centre - wp.transform_get_translation(plane)) - size[0]
+                point = centre - normal * (size[0] + real(0.5) * gap)
+                write(slots, env, topology.pair_slots[pair] + k, point, normal, gap, 0)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def sphere_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+        start, i = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            pair = first + i
+            sa = topology.pairs[pair, 0]
+            sb = topology.pairs[pair, 1]
+            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, sa))
+            capsule = shape_pose(topology, bodies, env, sb)
+            ra = topology.shape_size[sa][0]
+            rb = topology.shape_size[sb][0]
+            half = topology.shape_size[sb][1]
+            axis = z_axis(capsule)
+            p = centre - wp.transform_get_translation(capsule)
+            out = outside_segment(p, axis, half)
+            distance = wp.length(out)
+            n = direction(out, distance, real(MEETS) * rb, perpendicular(axis))  # from the capsule to the sphere
+            gap = distance - ra - rb
+            u = shape_velocity(topology, bodies, bodies.velocity, env, sa, centre)
+            u -= shape_velocity(topology, bodies, bodies.velocity, env, sb, centre)
+            ahead = outside_segment(p + h * u, axis, half)
+            b = bend(distance, n, h * u, wp.length(ahead), ahead)
+            write_bent(slots, env, topology.pair_slots[pair], centre - n * (ra + real(0.5) * gap), -n, gap, b, 0)
+
+    @wp.func
+    def beside_box(slots: Slots, env: int, slot: int, box: transform, size: vec3, c: vec3, e: vec3, half: real, r: real, motion: Motion):
+        """Points of a segment that does not meet the box: the ends of its stretch along the box, and the nearest one."""
+        nearest = c + e * nearest_to_box(c, e, half, size)
+        out = outside_box(nearest, size)
+        distance = wp.length(out)
+        k = int(0)
+        for m in range(1, 3):
+            if wp.abs(out[m]) > wp.abs(out[k]):
+                k = m
+        slack = real(ALONG) * r
+        # Over the face that is nearest; beside all faces, along the edge to which it is nearest.
+        s = whole(half)
+        for m in range(3):
+            if m != k:
+                s = cut(s, c[m], e[m], half, size[m], m, slack)
+        if s.low > s.high:
+            s = whole(half)
+            for m in range(3):
+                if wp.abs(nearest[m]) <= size[m] + slack:
+                    s = cut(s, c[m], e[m], half, size[m], m, slack)
+        low = wp.length(outside_box(c + s.low * e, size))
+        high = wp.length(outside_box(c + s.high * e, size))
+        covered = s.low <= s.high and wp.min(low, high) <= distance + real(covered_part) * r
+        if not covered:
+            write_near(
+                slots, env, slot + 2, motion, wp.transform_point(box, nearest), wp.transform_vector(box, out) / distance, distance, r, r, 0
+            )
+        if s.low <= s.high:
+            for j in range(2):
+                at = s.low
+                end = s.low_end
+                if j == 1:
+                    at = s.high
+                    end = s.high_end
+                # Where the nearest point lies on the edge that ends the stretch it stands for that end.
+                twice = bool(False)
+                if end > 0 and not covered:
+                    m = (end - 1) // 2
+                    twice = real(2 * ((end - 1) % 2) - 1) * nearest[m] >= size[m]
+                if not twice:
+                    p = c + at * e
+                    apart = outside_box(p, size)
+                    n = wp.transform_vector(box, apart) / wp.length(apart)
+                    write_near(slots, env, slot + j, motion, wp.transform_point(box, p), n, wp.length(apart), r, r, end)
+
+    @wp.func
+    def in_face(slots: Slots, env: int, slot: int, box: transform, size: vec3, c: vec3, e: vec3, half: real, r: real, near: real, k: int):
+        """Points of a segment that leaves a box through face k: the ends of its stretch between the other sides."""
+        side = real(1.0)
+        if c[k] < real(0.0):
+            side = real(-1.0)
+        outward = vec3()
+        outward[k] = side
+        normal = wp.transform_vector(box, outward)
+        s = whole(half)
+        for m in range(3):
+            if m != k:
+                s = cut(s, c[m], e[m], half, size[m], m, real(ALONG) * r)
+        for j in range(2):
+            at = s.low
+            end = s.low_end
+            if j == 1:
+                at = s.high
+                end = s.high_end
+            p = c + at * e
+            gap = side * p[k] - size[k] - r
+            if gap < near:
+                write(slots, env, slot + j, wp.transform_point(box, p) - normal * (r + real(0.5) * gap), normal, gap, end)
+
+    @wp.func
+    def in_edge(slots: Slots, env: int, slot: int, box: transform, size: vec3, c: vec3, e: vec3, half: real, r: real, n: vec3, m: int):
+        """The point of a segment that leaves a box over an edge along direction m; n is normal to both."""
+        corner = vec3()
+        for k in range(3):
+            if k != m:
+                corner[k] = size[k]
+                if n[k] < real(0.0):
+                    corner[k] = -size[k]
+        along = vec3()
+        along[m] = real(1.0)
+        p = c + e * nearest_to_segment(c - corner, e, half, along, size[m])
+        gap = wp.dot(n, c - corner) - r
+        normal = wp.transform_vector(box, n)
+        write(slots, env, slot + 2, wp.transform_point(box, p) - normal * (r + real(0.5) * gap), normal, gap, 0)
+
+    @wp.func
+    def inside_box(slots: Slots, env: int, slot: int, box: transform, size: vec3, c: vec3, e: vec3, half: real, r: real, near: real):
+        """Points of a segment that meets the box: it leaves along the separating axis of least overlap."""
+        axis = int(0)
+        best = wp.abs(c[0]) - wp.abs(e[0]) * half - size[0]
+        for k in range(1, 3):
+            s = wp.abs(c[k]) - wp.abs(e[k]) * half - size[k]
+            if s > best:
+                best = s
+                axis = k
+        # Prefer faces over edges, so that equal overlaps do not flip from step to step.
+        best += real(1.0e-3) * wp.min(size)
+        normal = vec3()
+        for m in range(3):
+            along = vec3()
+            along[m] = real(1.0)
+            n = wp.cross(e, along)
+            sine = wp.length(n)
+            if sine > real(1.0e-3):
+                n = n / sine
+                if wp.dot(n, c) < real(0.0):
+                    n = -n
+                s = wp.dot(n, c) - wp.abs(n[0]) * size[0] - wp.abs(n[1]) * size[1] - wp.abs(n[2]) * size[2]
+                if s > best:
+                    best = s
+                    axis = 3 + m
+                    normal = n
+        if axis < 3:
+            in_face(slots, env, slot, box, size, c, e, half, r, near, axis)
+        else:
+            in_edge(slots, env, slot, box, size, c, e, half, r, normal, axis - 3)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def box_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+        start, i = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            pair = first + i
+            sa = topology.pairs[pair, 0]
+            sb = topology.pairs[pair, 1]
+            box = shape_pose(topology, bodies, env, sa)
+            capsule = shape_pose(topology, bodies, env, sb)
+            size = topology.shape_size[sa]
+            r = topology.shape_size[sb][0]
+            half = topology.shape_size[sb][1]
+            slot = topology.pair_slots[pair]
+            for k in range(3):
+                slots.gap[env, slot + k] = real(NO_POINT)
+            centre = wp.transform_get_translation(box)
+            middle = wp.transform_get_translation(capsule)
+            near = reach(topology, bodies, env, sa, centre, wp.length(size), h) + reach(topology, bodies, env, sb, middle, half + r, h)
+            if wp.length(middle - centre) < wp.length(size) + half + r + near:
+                turn = wp.transform_get_rotation(box)
+                axis = z_axis(capsule)
+                c = wp.transform_point(wp.transform_inverse(box), middle)
+                e = wp.quat_rotate_inv(turn, axis)
+                if wp.length(outside_box(c + e * nearest_to_box(c, e, half, size), size)) > real(MEETS) * r:
+                    motion = relative_motion(topology, bodies, env, sa, sb, middle, h)
+                    motion.near = near
+                    ahead = c + wp.quat_rotate_inv(turn, motion.shift)
+                    e_ahead = wp.normalize(e + wp.quat_rotate_inv(turn, wp.cross(motion.turn, axis)))
+                    out = outside_box(ahead + e_ahead * nearest_to_box(ahead, e_ahead, half, size), size)
+                    motion.distance = wp.length(out)
+                    motion.normal = wp.quat_rotate(turn, out)
+                    beside_box(slots, env, slot, box, size, c, e, half, r, motion)
+                else:
+                    inside_box(slots, env, slot, box, size, c, e, half, r, near)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def capsule_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+        start, i = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            pair = first + i
+            sa = topology.pairs[pair, 0]
+            sb = topology.pairs[pair, 1]
+            a = shape_pose(topology, bodies, env, sa)
+            b = shape_pose(topology, bodies, env, sb)
+            ra = topology.shape_size[sa][0]
+            la = topology.shape_size[sa][1]
+            rb = topology.shape_size[sb][0]
+            lb = topology.shape_size[sb][1]
+            slot = topology.pair_slots[pair]
+            for k in range(3):
+                slots.gap[env, slot + k] = real(NO_POINT)
+            origin = wp.transform_get_translation(a)
+            middle = wp.transform_get_translation(b)
+            d = middle - origin
+            near = reach(topology, bodies, env, sa, origin, la + ra, h) + reach(topology, bodies, env, sb, middle, lb + rb, h)
+            if wp.length(d) < la + ra + lb + rb + near:
+                ea = z_axis(a)
+                eb = z_axis(b)
+                motion = relative_motion(topology, bodies, env, sa, sb, middle, h)
+                motion.near = near
+                ahead = d + motion.shift
+                e_ahead = wp.normalize(eb + wp.cross(motion.turn, eb))
+                motion.normal = outside_segment(ahead + e_ahead * nearest_to_segment(ahead, e_ahead, lb, ea, la), ea, la)
+                motion.distance = wp.length(motion.normal)
+
+                nearest = d + eb * nearest_to_segment(d, eb, lb, ea, la)
+                out = outside_segment(nearest, ea, la)
+                distance = wp.length(out)
+                # Segments that meet part across both, or where they are parallel, across one.
+                least = real(MEETS) * rb
+                across = perpendicular(ea)
+                if wp.length(wp.cross(ea, eb)) > real(1.0e-3):
+                    across = wp.normalize(wp.cross(ea, eb))
+                if wp.dot(across, d) < real(0.0):
+                    across = -across
+                s = cut(whole(lb), wp.dot(d, ea), wp.dot(eb, ea), lb, la, 0, real(ALONG) * rb)
+                if s.low > s.high:
+                    s = whole(lb)
+                low = wp.length(outside_segment(d + s.low * eb, ea, la))
+                high = wp.length(outside_segment(d + s.high * eb, ea, la))
+                covered = wp.min(low, high) <= distance + real(covered_part) * rb
+                if not covered:
+                    n = direction(out, distance, least, across)
+                    write_near(slots, env, slot + 2, motion, origin + nearest, n, distance, ra + rb, rb, 0)
+                for j in range(2):
+                    at = s.low
+                    end = s.low_end
+                    if j == 1:
+                        at = s.high
+                        end = s.high_end
+                    # Where the nearest point lies at the end of a that ends the stretch it stands for that end.
+                    twice = end > 0 and not covered and real(2 * end - 3) * wp.dot(nearest, ea) >= la
+                    if not twice:
+                        p = d + at * eb
+                        apart = outside_segment(p, ea, la)
+                        n = direction(apart, wp.length(apart), least, across)
+                        write_near(slots, env, slot + j, motion, origin + p, n, wp.length(apart), ra + rb, rb, end)
+
+    return {
+        ("PLANE", "CAPSULE"): plane_capsule,
+        ("SPHERE", "CAPSULE"): sphere_capsule,
+        ("BOX", "CAPSULE"): box_capsule,
+        ("CAPSULE", "CAPSULE"): capsule_capsule,
+    }
