@@ -54,6 +54,7 @@ def kernels(precision: str) -> dict[str, wp.Kernel]:
     for model in scenes():
         for method in (m for m in METHODS if precision == "float64" or m != "velocity_pivoting"):
             found += wl.Simulator(model, method=method, precision=precision, device="cpu").kernels
+        found += wl.Simulator(model, method="pgs", precision=precision, integrator="midpoint", device="cpu").kernels
     return {kernel.key.split("__")[-1]: kernel for kernel in found}
 
 

@@ -75,7 +75,7 @@ def _parser() -> _Parser:
     add("--directions", type=int, default=2, metavar="K", help="friction directions of a sticking contact (default 2)")
     add("--rho-scale", type=float, default=1.0, metavar="A", help="scale of the phantom inertia (default 1)")
     add("--precision", default="float64", metavar="P", help="float64 (default) or float32")
-    add("--integrator", default="euler", metavar="I", help="euler (default)")
+    add("--integrator", default="euler", metavar="I", help="euler (default) or midpoint")
     add("--device", metavar="D", help="Warp device, such as cpu or cuda:0 (default: a GPU if there is one)")
     add(
         "--every",

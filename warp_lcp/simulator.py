@@ -12,12 +12,13 @@ import numpy as np
 import warp as wp
 
 from .errors import SimulationError, WarpLcpError
-from .kernels import bodies, box_box, certify, collide, contacts, reset
+from .kernels import bodies, box_box, certify, collide, contacts, integrate, reset
 from .kernels.types import scalar_types
 from .methods import METHODS, chosen
 from .model import Model, ShapeType
 
 SLIDING = ("regularized", "aligned", "facets")
+INTEGRATORS = ("euler", "midpoint")
 PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.float32)}
 #: Parameters that may differ between environments, and what their numbers must be.
 PARAMETERS = {
@@ -84,7 +85,8 @@ class Simulator:
         directions: k, friction directions of a sticking contact, at least 2.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
         precision: 'float64' or 'float32', of state and solution.
-        integrator: 'euler', q+ = q + h Gamma v+ (eq. 23).
+        integrator: 'euler', q+ = q + h Gamma v+ (eq. 23), or 'midpoint', q+ = q + h Gamma (v + v+) / 2 but for bodies that
+            this would drive into others: second order away from impacts.
         device: Warp device; None = Warp's default.
         strict: raise after a step in which an environment's status is not OK (reads the status back every time).
 
@@ -122,7 +124,7 @@ class Simulator:
         _choice("method", method, tuple(METHODS))
         _choice("sliding", sliding, SLIDING)
         _choice("precision", precision, tuple(PRECISIONS))
-        _choice("integrator", integrator, ("euler",))
+        _choice("integrator", integrator, INTEGRATORS)
         if int(num_envs) != num_envs or num_envs < 1:
             raise WarpLcpError(f"num_envs is {num_envs}; give a whole number of at least 1")
         if int(directions) != directions or directions < 2:
@@ -133,11 +135,13 @@ class Simulator:
             raise WarpLcpError(f"rho_scale is {rho_scale}; it must be finite and greater than zero")
         self.model, self.num_envs, self.dt = model, int(num_envs), float(dt)
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
+        self.integrator = integrator
         self.directions, self.rho_scale, self.strict = int(directions), float(rho_scale), bool(strict)
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
         self.tolerance = TOLERANCE
         self.sign_tolerance = 1e-12 if self.real is wp.float64 else 1e-6
+        self.rounding = 2.0**-50 if self.real is wp.float64 else 2.0**-21  # what a gap is known to, as a part of a coordinate
         self._types = scalar_types(self.real)
         self._allocate()
         self._load_kernels()
@@ -286,7 +290,11 @@ class Simulator:
             answer = [self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, self.status]
             problem = [self.bodies, h, self.tolerance, i, final, self.next_velocity, self.rows, self.slots]
             self.launch(k.certify, [*problem, *answer])
-        self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
+        if self.integrator == "midpoint":
+            self.launch(k.guard, [self.parameters, self.bodies, self.rows, self.next_velocity, h, self.tolerance, self.rounding])
+            self.launch(k.integrate_midpoint, [*scene, self.bodies, self.next_velocity, self.wrench, h, self.q, self.v], b)
+        else:
+            self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
         self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
 
     def launch(self, kernel: wp.Kernel, inputs: list[Any], width: int = 1) -> None:
@@ -371,7 +379,7 @@ class Simulator:
         self.residual, self.residual_energy, self.best_residual = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(3))
 
     def _load_kernels(self) -> None:
-        self._kernels, self._pair_kernels = stage_kernels(self.model, self.real)
+        self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator)
         self._methods = [method(self.model, self.real) for method in chosen(self.method, self.precision)]
         for method in self._methods:
             method.prepare(self)
@@ -384,18 +392,21 @@ class Simulator:
             wp.force_load(self.device, modules=modules, block_dim=block_dim)
 
 
-def stage_kernels(model: Model, real: Any) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
+def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
     """Kernels of the stages by name, and (kernel, first pair, number of pairs) for each kind of pair in the model."""
-    body, rows, answer = bodies.make(real), contacts.make(real), certify.make(real)
+    body, rows, motion = bodies.make(real), contacts.make(real), integrate.make(real)
     stages = SimpleNamespace(
         kinematics=body.kinematics,
         free_motion=body.free_motion,
         select_contacts=rows.select_contacts,
         contact_rows=rows.contact_rows,
-        certify=answer.certify,
-        integrate=answer.integrate,
+        certify=certify.make(real),
         reset=reset.make(real),
     )
+    if integrator == "midpoint":
+        stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
+    else:
+        stages.integrate = motion.integrate
     kinds = [tuple(ShapeType(model.shape_type[s]).name for s in pair) for pair in model.pairs]
     pairs = []
     for kind in dict.fromkeys(kinds):
@@ -404,10 +415,10 @@ def stage_kernels(model: Model, real: Any) -> tuple[SimpleNamespace, list[tuple[
     return stages, pairs
 
 
-def kernel_names(model: Model, method: str = "auto", precision: str = "float64") -> list[str]:
+def kernel_names(model: Model, method: str = "auto", precision: str = "float64", integrator: str = "euler") -> list[str]:
     """Names of the kernels that a Simulator of the model compiles."""
     real = PRECISIONS[precision][0]
-    stages, pairs = stage_kernels(model, real)
+    stages, pairs = stage_kernels(model, real, integrator)
     solvers = [kind(model, real).kernel for kind in chosen(method, precision)]
     return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *(k for k, *_ in pairs), *solvers)]
 
