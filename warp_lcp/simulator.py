@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ from .kernels import bodies, box_box, certify, collide, contacts, integrate, res
 from .kernels.types import scalar_types
 from .methods import METHODS, chosen
 from .model import Model, ShapeType
+from .rollout import Recorder, Rollout
 
 SLIDING = ("regularized", "aligned", "facets")
 INTEGRATORS = ("euler", "midpoint")
@@ -94,11 +96,11 @@ class Simulator:
         q, v: [E, nq], [E, nv] state, writable in place.
         q0, v0: the state that :meth:`reset` copies back, writable.
         wrench: [E, B] spatial vector, force [N] and torque [N m] at the centre of mass, world axes; stays until changed.
-        status: [E] :class:`Status` bits of the last step() call, or-ed over its steps.
+        status: [E] :class:`Status` bits of the last step() or rollout() call, or-ed over its steps.
         residual: [E] m/s, largest violation of the law that was solved, of the last step.
         residual_energy: [E] J, unit-consistent energy error of the last step.
-        iterations: [E] solves, pivots or sweeps of the last step() call, summed over its steps.
-        time: simulated seconds. last_count: steps of the last step() call.
+        iterations: [E] solves, pivots or sweeps of the last step() or rollout() call, summed over its steps.
+        time: simulated seconds. last_count: steps of the last step() or rollout() call.
 
     Raises:
         WarpLcpError: for an argument outside its range.
@@ -145,7 +147,8 @@ class Simulator:
         self._types = scalar_types(self.real)
         self._allocate()
         self._load_kernels()
-        self._graph: Any = None
+        self._graphs: dict[str, Any] = {}
+        self._recorder: Recorder | None = None
         self.time = 0.0
         self.last_count = 0
 
@@ -155,12 +158,37 @@ class Simulator:
         """Advance every environment by ``count`` steps (0 only prepares)."""
         if int(count) != count or count < 0:
             raise WarpLcpError(f"step: count is {count}; give a whole number of at least 0")
-        if self._graph is None:
-            self._record()
+        graph = self._captured("step", self._step_kernels)
         self.status.zero_()
         self.iterations.zero_()
         for _ in range(count):
-            wp.capture_launch(self._graph)
+            wp.capture_launch(graph)
+        self._finish(count)
+
+    def rollout(self, steps: int, wrench: Any = None, record: Sequence[str] = ("q", "v", "status"), every: int = 1) -> Rollout:
+        """Advance every environment by ``steps`` steps and record them on the device, without waiting for it.
+
+        The same bits as as many step() calls, each after writing its wrench into :attr:`wrench`, where the last one
+        stays. The step is captured once for all rollouts; arrays are new each time. Status and iterations of the
+        simulator are afterwards those of all steps, as after step(steps).
+
+        Args:
+            steps: number of steps, at least 1.
+            wrench: None: what :attr:`wrench` holds, throughout. Or one for each step, [steps, num_envs, B] or [steps, 1, B]
+                (the same for all environments): a Warp array of spatial vectors of the simulator's precision on its
+                device, or numbers [..., 6]; force [N] and torque [N m] at the centre of mass, world axes.
+            record: what to record, names of :class:`Rollout`'s fields (or one name alone).
+            every: steps to a row, at least 1; steps // every rows. What is left over is stepped, not recorded.
+
+        Raises:
+            WarpLcpError: for an argument outside its range.
+            SimulationError: if strict, after a rollout in which an environment's status was not OK.
+        """
+        if self._recorder is None:
+            self._recorder = Recorder(self)
+        return self._recorder.run(steps, wrench, record, every)
+
+    def _finish(self, count: int) -> None:
         self.time += count * self.dt
         self.last_count = count
         if self.strict:
@@ -210,7 +238,7 @@ class Simulator:
                 present.assign(value.astype(self._numpy_real))
             else:
                 setattr(self.parameters, name, self._constant(value, present.dtype))
-                self._graph = None  # it holds the address of the old array
+                self._graphs.clear()  # they hold the address of the old array
 
     def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
         if name not in PARAMETERS:
@@ -306,10 +334,13 @@ class Simulator:
         threads = 1 if self.device.is_cpu else self.num_envs
         wp.launch(kernel, dim=(threads, width), inputs=[*inputs, threads], device=self.device)
 
-    def _record(self) -> None:
-        with wp.ScopedCapture(device=self.device) as capture:
-            self._step_kernels()
-        self._graph = capture.graph
+    def _captured(self, name: str, launches: Callable[[], None]) -> Any:
+        """The graph of some launches, captured when first asked for."""
+        if name not in self._graphs:
+            with wp.ScopedCapture(device=self.device) as capture:
+                launches()
+            self._graphs[name] = capture.graph
+        return self._graphs[name]
 
     # --------------------------------------------------------------------------------------------------- allocation
 
