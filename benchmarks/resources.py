@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Registers, spills and shared memory of every kernel, compiled for a GPU on any machine.
 
-Compiles each kernel that a Simulator can create, and those of solve_lcp and the logger, for sm_90 without a driver, counts the entry
-points in the binaries and reads their resources with cuobjdump (PyPI: nvidia-cuda-cuobjdump).
+Compiles each kernel that a Simulator can create, and those of solve_lcp, rollouts and the logger, for sm_90 without a
+driver, counts the entry points in the binaries and reads their resources with cuobjdump (PyPI: nvidia-cuda-cuobjdump).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import warp as wp
-from warp_lcp.kernels import lemke, problems, watch
+from warp_lcp.kernels import lemke, problems, record, watch
 
 import warp_lcp as wl
 from warp_lcp.methods import METHODS
@@ -53,9 +53,11 @@ def kernels(precision: str) -> dict[str, wp.Kernel]:
     """Every kernel of one precision by its name."""
     real = PRECISIONS[precision][0]
     found = [lemke.make(real), problems.make(real), watch.collect_status]
+    found += [part for part in vars(record.make(real)).values() if isinstance(part, wp.Kernel)]
     for model in scenes():
         for method in (m for m in METHODS if precision == "float64" or m != "velocity_pivoting"):
             found += wl.Simulator(model, method=method, precision=precision, device="cpu").kernels
+        found += wl.Simulator(model, method="pgs", precision=precision, integrator="midpoint", device="cpu").kernels
     return {kernel.key.split("__")[-1]: kernel for kernel in found}
 
 

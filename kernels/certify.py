@@ -13,23 +13,22 @@ residual is the largest of them; sum m r^2 / 2 is the unit-consistent energy err
 """
 
 import functools
-from types import SimpleNamespace
 
 import warp as wp
 
 from . import friction, rigid
-from .types import FIXED, NOT_A_NUMBER, OPEN, SLIDE, STICK, UNCERTIFIED, scalar_types
+from .types import NOT_A_NUMBER, OPEN, SLIDE, STICK, UNCERTIFIED, scalar_types
 
 # Residual of an answer that is not a number.
 HUGE = wp.constant(1.0e30)
 
 
 @functools.cache
-def make(real) -> SimpleNamespace:
-    """Kernels ``certify`` (dim E) and ``integrate`` (dim E, B)."""
+def make(real):
+    """Kernel ``certify``; launch with dim (E)."""
     t = scalar_types(real)
-    vec2, vec3, transform, spatial = t.vec2, t.vec3, t.transform, t.spatial
-    Bodies, Contacts, Slots, Topology = t.Bodies, t.Contacts, t.Slots, t.Topology
+    vec2, vec3, spatial = t.vec2, t.vec3, t.spatial
+    Bodies, Contacts, Slots = t.Bodies, t.Contacts, t.Slots
     law = friction.functions(real)
     project_friction, weigh, law_error = law.project_friction, law.weigh, law.law_error
     body = rigid.functions(real)
@@ -164,37 +163,4 @@ def make(real) -> SimpleNamespace:
                         slots.last_impulse[env, slot] = p[0]
                         slots.last_bristle[env, slot] = wp.transpose(contacts.frame[env, i]) * bristle
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def integrate(
-        topology: Topology,
-        bodies: Bodies,
-        next_velocity: wp.array2d(dtype=spatial),
-        h: real,
-        q: wp.array2d(dtype=real),
-        v: wp.array2d(dtype=real),
-        stride: int,
-    ):
-        """q+ = q + h Gamma(q) v+ (eq. 23): the centre of mass moves straight, the body turns about it."""
-        start, b = wp.tid()
-        for env in range(start, q.shape[0], stride):
-            if topology.joint_type[b] == FIXED:
-                continue
-            i = topology.q_start[b]
-            j = topology.v_start[b]
-            velocity = next_velocity[env, b]
-            pose = bodies.pose[env, b]
-            w = wp.spatial_bottom(velocity)
-            angle = h * wp.length(w)
-            turn = wp.quat_identity(dtype=real)
-            if angle > real(0.0):
-                turn = wp.quat_from_axis_angle(wp.normalize(w), angle)
-            rotation = wp.normalize(turn * wp.transform_get_rotation(pose))
-            com = bodies.com[env, b]
-            offset = wp.quat_rotate(turn, wp.transform_get_translation(pose) - com)
-            pose = transform(com + h * wp.spatial_top(velocity) + offset, rotation)
-            for k in range(7):
-                q[env, i + k] = pose[k]
-            for k in range(6):
-                v[env, j + k] = velocity[k]
-
-    return SimpleNamespace(certify=certify, integrate=integrate)
+    return certify

@@ -43,7 +43,9 @@ def test_equal_environments_stay_equal(method):
     assert (bits(sim) == bits(sim)[0]).all()
 
 
-@pytest.mark.parametrize("options", [{}, {"method": "pgs", "precision": "float32"}], ids=["auto", "pgs float32"])
+@pytest.mark.parametrize(
+    "options", [{}, {"method": "pgs", "precision": "float32"}, {"integrator": "midpoint"}], ids=["auto", "pgs float32", "midpoint"]
+)
 def test_a_batch_is_bit_identical_to_its_environments_alone(options):
     """1024 environments with their own mu, m, I; then the same alone, in another batch, and the whole once more."""
     whole = randomised(1024, **options)
@@ -78,11 +80,12 @@ def test_recorded_steps_equal_eager_steps():
 
 def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
     """What a GPU does differently, done on the CPU: environments fastest in memory, a thread for each, several workspaces."""
-    expected = {}
-    for method in ("auto", "lemke"):
-        sim = randomised(40, method=method)
+    cases = [{"method": "auto"}, {"method": "lemke"}, {"integrator": "midpoint"}]
+    expected = []
+    for options in cases:
+        sim = randomised(40, **options)
         sim.step(200)
-        expected[method] = bits(sim)
+        expected.append(bits(sim))
 
     def array(self, n, dtype):
         return wp.zeros((n, self.num_envs), dtype=dtype, device=self.device).transpose()
@@ -93,11 +96,11 @@ def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
     monkeypatch.setattr(wl.Simulator, "_array", array)
     monkeypatch.setattr(wl.Simulator, "launch", launch)
     monkeypatch.setattr("warp_lcp.methods.workspaces", lambda envs, scalars, device: 7)
-    for method in ("auto", "lemke"):
-        sim = randomised(40, method=method)
+    for options, same in zip(cases, expected, strict=True):
+        sim = randomised(40, **options)
         assert sim.q.strides[0] < sim.q.strides[1]
         sim.step(200)
-        assert (bits(sim) == expected[method]).all()
+        assert (bits(sim) == same).all()
 
 
 def test_a_nan_is_flagged_contained_and_healed_by_a_masked_reset():
@@ -260,7 +263,7 @@ def test_scenes_without_contacts_or_movable_bodies():
         ({"precision": "half"}, "choose one of float64, float32"),
         ({"formulation": "magic"}, "choose one of phantom_inertia"),
         ({"sliding": "no"}, "choose one of regularized, aligned, facets"),
-        ({"integrator": "rk4"}, "choose one of euler"),
+        ({"integrator": "rk4"}, "choose one of euler, midpoint"),
         ({"method": "velocity_pivoting", "precision": "float32"}, "needs precision 'float64'"),
     ],
 )

@@ -177,6 +177,17 @@ def test_options_reach_the_simulator(capsys):
     assert (facts["method"], facts["precision"], facts["formulation"], facts["steps"]) == ("pgs", "float64", "phantom_inertia", 50)
 
 
+def test_the_midpoint_rule_reaches_the_simulator(tmp_path):
+    """A box sliding at 10 ms ends up elsewhere than with Euler, by half a step at 5 m/s."""
+    ends = []
+    for integrator in ("euler", "midpoint"):
+        path = tmp_path / f"{integrator}.npz"
+        assert run("box_on_ground", "--dt", 0.01, "--duration", 0.8, "--integrator", integrator, "--out", path) == 0
+        with np.load(path) as file:
+            ends.append(file["pose"][-1, 0, 0, 1])
+    assert ends[1] - ends[0] == pytest.approx(0.5 * 0.01 * 5.0, rel=0.01)
+
+
 def test_what_is_not_certified_is_said_and_the_exit_status_stays_zero(capsys, monkeypatch):
     add = Tally.add
 

@@ -23,6 +23,7 @@ _PUBLIC = {
     "ModelError": "errors",
     "Report": "model",
     "RerunLogger": "logger",
+    "Rollout": "rollout",
     "SceneError": "errors",
     "ShapeType": "model",
     "SimulationError": "errors",

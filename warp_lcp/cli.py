@@ -75,7 +75,7 @@ def _parser() -> _Parser:
     add("--directions", type=int, default=2, metavar="K", help="friction directions of a sticking contact (default 2)")
     add("--rho-scale", type=float, default=1.0, metavar="A", help="scale of the phantom inertia (default 1)")
     add("--precision", default="float64", metavar="P", help="float64 (default) or float32")
-    add("--integrator", default="euler", metavar="I", help="euler (default)")
+    add("--integrator", default="euler", metavar="I", help="euler (default) or midpoint")
     add("--device", metavar="D", help="Warp device, such as cpu or cuda:0 (default: a GPU if there is one)")
     add(
         "--every",
@@ -160,7 +160,7 @@ def _model_facts(model: Model) -> dict[str, Any]:
     }
 
 
-def bytes_per_env(model: Model) -> int:
+def bytes_per_env(model: Model, formulation: str = "phantom_inertia") -> int:
     """Bytes that one more environment takes, float64: state, contacts and their history, without the method's workspace."""
     import warp as wp
 
@@ -172,7 +172,9 @@ def bytes_per_env(model: Model) -> int:
     total += 2 * model.num_bodies * wp.types.type_size_in_bytes(types.spatial)  # wrench, next velocity
     total += 4 * 4 + 3 * 8  # status, iterations, unsolved, reason; residuals, that of the best answer among them
     for bundle, width in widths.items():
-        for variable in bundle.vars.values():
+        for name, variable in bundle.vars.items():
+            if name == "slip" and formulation != "coulomb":
+                continue
             total += wp.types.type_size_in_bytes(variable.type.dtype) * (1 if variable.type.ndim == 1 else width)
     return total
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -12,13 +13,15 @@ import numpy as np
 import warp as wp
 
 from .errors import SimulationError, WarpLcpError
-from .kernels import bodies, box_box, capsule, certify, collide, contacts, reset
+from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset
 from .kernels.types import scalar_types
 from .methods import METHODS, chosen
 from .model import Model, ShapeType
+from .rollout import Recorder, Rollout
 
 FORMULATIONS = ("phantom_inertia", "anitescu_potra", "box", "hybrid", "coulomb")
 SLIDING = ("regularized", "aligned", "facets")
+INTEGRATORS = ("euler", "midpoint")
 PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.float32)}
 #: Parameters that may differ between environments, and what their numbers must be.
 PARAMETERS = {
@@ -85,7 +88,8 @@ class Simulator:
         directions: k, friction directions of a sticking contact, at least 2.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
         precision: 'float64' or 'float32', of state and solution.
-        integrator: 'euler', q+ = q + h Gamma v+ (eq. 23).
+        integrator: 'euler', q+ = q + h Gamma v+ (eq. 23), or 'midpoint', q+ = q + h Gamma (v + v+) / 2 but for bodies that
+            this would drive into others: second order away from impacts.
         device: Warp device; None = Warp's default.
         strict: raise after a step in which an environment's status is not OK (reads the status back every time).
 
@@ -93,11 +97,11 @@ class Simulator:
         q, v: [E, nq], [E, nv] state, writable in place.
         q0, v0: the state that :meth:`reset` copies back, writable.
         wrench: [E, B] spatial vector, force [N] and torque [N m] at the centre of mass, world axes; stays until changed.
-        status: [E] :class:`Status` bits of the last step() call, or-ed over its steps.
+        status: [E] :class:`Status` bits of the last step() or rollout() call, or-ed over its steps.
         residual: [E] m/s, largest violation of the law that was solved, of the last step.
         residual_energy: [E] J, unit-consistent energy error of the last step.
-        iterations: [E] solves, pivots or sweeps of the last step() call, summed over its steps.
-        time: simulated seconds. last_count: steps of the last step() call.
+        iterations: [E] solves, pivots or sweeps of the last step() or rollout() call, summed over its steps.
+        time: simulated seconds. last_count: steps of the last step() or rollout() call.
 
     Raises:
         WarpLcpError: for an argument outside its range.
@@ -123,7 +127,7 @@ class Simulator:
         _choice("method", method, tuple(METHODS))
         _choice("sliding", sliding, SLIDING)
         _choice("precision", precision, tuple(PRECISIONS))
-        _choice("integrator", integrator, ("euler",))
+        _choice("integrator", integrator, INTEGRATORS)
         if int(num_envs) != num_envs or num_envs < 1:
             raise WarpLcpError(f"num_envs is {num_envs}; give a whole number of at least 1")
         if int(directions) != directions or directions < 2:
@@ -134,16 +138,19 @@ class Simulator:
             raise WarpLcpError(f"rho_scale is {rho_scale}; it must be finite and greater than zero")
         self.model, self.num_envs, self.dt = model, int(num_envs), float(dt)
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
+        self.integrator = integrator
         self.directions, self.rho_scale, self.strict = int(directions), float(rho_scale), bool(strict)
         self._law = _law(formulation, sliding, self.directions)
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
         self.tolerance = TOLERANCE
         self.sign_tolerance = 1e-12 if self.real is wp.float64 else 1e-6
+        self.rounding = 2.0**-50 if self.real is wp.float64 else 2.0**-21  # what a gap is known to, as a part of a coordinate
         self._types = scalar_types(self.real)
         self._allocate()
         self._load_kernels()
-        self._graph: Any = None
+        self._graphs: dict[str, Any] = {}
+        self._recorder: Recorder | None = None
         self.time = 0.0
         self.last_count = 0
 
@@ -153,12 +160,37 @@ class Simulator:
         """Advance every environment by ``count`` steps (0 only prepares)."""
         if int(count) != count or count < 0:
             raise WarpLcpError(f"step: count is {count}; give a whole number of at least 0")
-        if self._graph is None:
-            self._record()
+        graph = self._captured("step", self._step_kernels)
         self.status.zero_()
         self.iterations.zero_()
         for _ in range(count):
-            wp.capture_launch(self._graph)
+            wp.capture_launch(graph)
+        self._finish(count)
+
+    def rollout(self, steps: int, wrench: Any = None, record: Sequence[str] = ("q", "v", "status"), every: int = 1) -> Rollout:
+        """Advance every environment by ``steps`` steps and record them on the device, without waiting for it.
+
+        The same bits as as many step() calls, each after writing its wrench into :attr:`wrench`, where the last one
+        stays. The step is captured once for all rollouts; arrays are new each time. Status and iterations of the
+        simulator are afterwards those of all steps, as after step(steps).
+
+        Args:
+            steps: number of steps, at least 1.
+            wrench: None: what :attr:`wrench` holds, throughout. Or one for each step, [steps, num_envs, B] or [steps, 1, B]
+                (the same for all environments): a Warp array of spatial vectors of the simulator's precision on its
+                device, or numbers [..., 6]; force [N] and torque [N m] at the centre of mass, world axes.
+            record: what to record, names of :class:`Rollout`'s fields (or one name alone).
+            every: steps to a row, at least 1; steps // every rows. What is left over is stepped, not recorded.
+
+        Raises:
+            WarpLcpError: for an argument outside its range.
+            SimulationError: if strict, after a rollout in which an environment's status was not OK.
+        """
+        if self._recorder is None:
+            self._recorder = Recorder(self)
+        return self._recorder.run(steps, wrench, record, every)
+
+    def _finish(self, count: int) -> None:
         self.time += count * self.dt
         self.last_count = count
         if self.strict:
@@ -208,7 +240,7 @@ class Simulator:
                 present.assign(value.astype(self._numpy_real))
             else:
                 setattr(self.parameters, name, self._constant(value, present.dtype))
-                self._graph = None  # it holds the address of the old array
+                self._graphs.clear()  # they hold the address of the old array
 
     def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
         if name not in PARAMETERS:
@@ -287,7 +319,11 @@ class Simulator:
             answer = [self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, self.status]
             problem = [self.bodies, h, self.tolerance, i, final, self.next_velocity, self.rows, self.slots]
             self.launch(k.certify, [*problem, *answer])
-        self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
+        if self.integrator == "midpoint":
+            self.launch(k.guard, [self.parameters, self.bodies, self.rows, self.next_velocity, h, self.tolerance, self.rounding])
+            self.launch(k.integrate_midpoint, [*scene, self.bodies, self.next_velocity, self.wrench, h, self.q, self.v], b)
+        else:
+            self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
         self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
 
     def launch(self, kernel: wp.Kernel, inputs: list[Any], width: int = 1) -> None:
@@ -299,10 +335,13 @@ class Simulator:
         threads = 1 if self.device.is_cpu else self.num_envs
         wp.launch(kernel, dim=(threads, width), inputs=[*inputs, threads], device=self.device)
 
-    def _record(self) -> None:
-        with wp.ScopedCapture(device=self.device) as capture:
-            self._step_kernels()
-        self._graph = capture.graph
+    def _captured(self, name: str, launches: Callable[[], None]) -> Any:
+        """The graph of some launches, captured when first asked for."""
+        if name not in self._graphs:
+            with wp.ScopedCapture(device=self.device) as capture:
+                launches()
+            self._graphs[name] = capture.graph
+        return self._graphs[name]
 
     # --------------------------------------------------------------------------------------------------- allocation
 
@@ -373,7 +412,7 @@ class Simulator:
         self.residual, self.residual_energy, self.best_residual = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(3))
 
     def _load_kernels(self) -> None:
-        self._kernels, self._pair_kernels = stage_kernels(self.model, self.real)
+        self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator)
         self._methods = [method(self.model, self.real) for method in chosen(self.method, self.precision)]
         for method in self._methods:
             method.prepare(self)
@@ -386,18 +425,21 @@ class Simulator:
             wp.force_load(self.device, modules=modules, block_dim=block_dim)
 
 
-def stage_kernels(model: Model, real: Any) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
+def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
     """Kernels of the stages by name, and (kernel, first pair, number of pairs) for each kind of pair in the model."""
-    body, rows, answer = bodies.make(real), contacts.make(real), certify.make(real)
+    body, rows, motion = bodies.make(real), contacts.make(real), integrate.make(real)
     stages = SimpleNamespace(
         kinematics=body.kinematics,
         free_motion=body.free_motion,
         select_contacts=rows.select_contacts,
         contact_rows=rows.contact_rows,
-        certify=answer.certify,
-        integrate=answer.integrate,
+        certify=certify.make(real),
         reset=reset.make(real),
     )
+    if integrator == "midpoint":
+        stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
+    else:
+        stages.integrate = motion.integrate
     kinds = [tuple(ShapeType(model.shape_type[s]).name for s in pair) for pair in model.pairs]
     pairs = []
     for kind in dict.fromkeys(kinds):
@@ -407,10 +449,10 @@ def stage_kernels(model: Model, real: Any) -> tuple[SimpleNamespace, list[tuple[
     return stages, pairs
 
 
-def kernel_names(model: Model, method: str = "auto", precision: str = "float64") -> list[str]:
+def kernel_names(model: Model, method: str = "auto", precision: str = "float64", integrator: str = "euler") -> list[str]:
     """Names of the kernels that a Simulator of the model compiles."""
     real = PRECISIONS[precision][0]
-    stages, pairs = stage_kernels(model, real)
+    stages, pairs = stage_kernels(model, real, integrator)
     solvers = [kind(model, real).kernel for kind in chosen(method, precision)]
     return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *(k for k, *_ in pairs), *solvers)]
 

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many steps in one go, with their states recorded on the device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from .errors import WarpLcpError
+from .kernels import record as recording
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+#: What a rollout can record.
+FIELDS = ("q", "v", "body_pose", "body_velocity", "status", "iterations", "residual", "residual_energy")
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """What Simulator.rollout recorded: T rows, E environments, B bodies; None is what was not asked for.
+
+    Row i is the state after step (i + 1) * every; the state that the rollout started from has no row. The arrays are
+    contiguous, on the simulator's device, and belong to whoever called: no later rollout writes into them. Work on them in
+    the same CUDA stream, or synchronise first; DLPack (torch.from_dlpack, np.from_dlpack, jax) takes them without a copy.
+
+    Attributes:
+        time: [T] numpy, simulated seconds.
+        q, v: [T, E, nq], [T, E, nv].
+        body_pose: [T, E, B] transform (x y z qx qy qz qw) of the body frames, world.
+        body_velocity: [T, E, B] spatial vector (velocity of the centre of mass [m/s], angular velocity [rad/s]), world axes.
+        status: [T, E] Status bits, or-ed over the steps since the row before.
+        iterations: [T, E] solves, pivots or sweeps, summed over the steps since the row before.
+        residual: [T, E] m/s, of the row's step.
+        residual_energy: [T, E] J, of the row's step.
+    """
+
+    time: np.ndarray
+    q: wp.array | None = None
+    v: wp.array | None = None
+    body_pose: wp.array | None = None
+    body_velocity: wp.array | None = None
+    status: wp.array | None = None
+    iterations: wp.array | None = None
+    residual: wp.array | None = None
+    residual_energy: wp.array | None = None
+
+
+class Recorder:
+    """What the rollouts of one Simulator share: kernels, the step counters and the tape that its captured step looks at."""
+
+    def __init__(self, sim: Simulator):
+        self.sim = sim
+        self.kernels = k = recording.make(sim.real)
+        # Threads that share a row; on the CPU, where a row is contiguous, one walks over it.
+        self.columns = 1 if sim.device.is_cpu else max(sim.model.nq, sim.model.nv, sim.model.num_bodies)
+        self.step = wp.zeros((sim.num_envs, self.columns), dtype=int, device=sim.device)
+        self.tape = wp.zeros(1, dtype=k.Tape, device=sim.device)
+        self.seen_status, self.seen_iterations = (wp.zeros(sim.num_envs, dtype=int, device=sim.device) for _ in range(2))
+        # Before any capture: modules cannot be loaded within one.
+        wp.force_load(sim.device, modules=[kernel.module for kernel in (k.apply_wrench, k.record_row, k.add_seen)])
+
+    def run(self, steps: int, wrench: Any, record: Any, every: int) -> Rollout:
+        """See Simulator.rollout."""
+        sim, k = self.sim, self.kernels
+        for name, value, least in (("steps", steps, 1), ("every", every, 1)):
+            if not isinstance(value, (int, np.integer)) or value < least:
+                raise WarpLcpError(f"rollout: {name} is {value!r}; give a whole number of at least {least}")
+        if every > steps:
+            raise WarpLcpError(f"rollout: every is {every}, more than the {steps} steps: no row would be recorded")
+        if not isinstance(record, Iterable):
+            raise WarpLcpError(f"rollout: record is {record!r}; give names out of {', '.join(FIELDS)}")
+        names = (record,) if isinstance(record, str) else tuple(record)
+        for name in names:
+            if name not in FIELDS:
+                raise WarpLcpError(f"rollout: record holds {name!r}; choose from {', '.join(FIELDS)}")
+        source = None if wrench is None else self._wrench(wrench, steps)
+
+        rows = steps // every
+        arrays = {name: self._empty(name, rows) for name in dict.fromkeys(names)}
+        tape = k.Tape()
+        tape.every = every
+        for name, array in arrays.items():
+            setattr(tape, name, array)
+        if source is not None:
+            tape.wrench = source
+        self.tape.assign(wp.array([tape], dtype=k.Tape, device="cpu"))
+        for zeroed in (self.step, self.seen_status, self.seen_iterations, sim.status, sim.iterations):
+            zeroed.zero_()
+
+        graph = sim._captured("rollout", self._step) if source is None else sim._captured("pushed rollout", self._pushed_step)
+        for _ in range(steps):
+            wp.capture_launch(graph)
+        wp.launch(
+            k.add_seen, dim=sim.num_envs, inputs=[self.seen_status, self.seen_iterations, sim.status, sim.iterations], device=sim.device
+        )
+        time = sim.time + sim.dt * every * np.arange(1, rows + 1)
+        sim._finish(steps)
+        return Rollout(time, **arrays)
+
+    def _pushed_step(self) -> None:
+        self.sim.launch(self.kernels.apply_wrench, [self.tape, self.step, self.sim.wrench], self.sim.model.num_bodies)
+        self._step()
+
+    def _step(self) -> None:
+        sim = self.sim
+        sim._step_kernels()
+        state = [sim.q, sim.v, sim.bodies, sim.status, sim.iterations, sim.residual, sim.residual_energy]
+        seen = [self.seen_status, self.seen_iterations]
+        sim.launch(self.kernels.record_row, [self.tape, self.step, *state, *seen, self.columns], self.columns)
+
+    def _empty(self, name: str, rows: int) -> wp.array:
+        sim, t = self.sim, self.sim._types
+        widths = {"q": sim.model.nq, "v": sim.model.nv, "body_pose": sim.model.num_bodies, "body_velocity": sim.model.num_bodies}
+        kinds = {"body_pose": t.transform, "body_velocity": t.spatial, "status": int, "iterations": int}
+        shape = (rows, sim.num_envs, widths[name]) if name in widths else (rows, sim.num_envs)
+        return wp.empty(shape, dtype=kinds.get(name, sim.real), device=sim.device)
+
+    def _wrench(self, wrench: Any, steps: int) -> wp.array:
+        """Wrenches of all steps on the device: [steps, 1|E, B] spatial vectors."""
+        sim, spatial = self.sim, self.sim._types.spatial
+        e, b = sim.num_envs, sim.model.num_bodies
+        allowed = [(steps, e, b), (steps, 1, b)]
+        if isinstance(wrench, wp.array):
+            if wrench.dtype is not spatial or wrench.shape not in allowed or wrench.device != sim.device:
+                raise WarpLcpError(
+                    f"rollout: wrench is {wrench.shape} of {wrench.dtype.__name__} on {wrench.device}; "
+                    f"give {allowed[0]} or {allowed[1]} of {spatial.__name__} on {sim.device}"
+                )
+            return wrench
+        try:
+            values = np.asarray(wrench, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise WarpLcpError(f"rollout: wrench is no array of numbers: {error}") from error
+        if values.shape not in [(*shape, 6) for shape in allowed]:
+            raise WarpLcpError(f"rollout: wrench has shape {values.shape}; give {(*allowed[0], 6)} or {(*allowed[1], 6)}")
+        return sim._constant(values, spatial)
