@@ -58,14 +58,20 @@ class Session:
         if (line := self.reply()) != "ready":
             raise PeerError(f"{self.name}: the adapter said {line!r} instead of 'ready'")
 
-    def repeat(self) -> None:
-        """Start one repetition."""
+    def go_on(self) -> None:
+        """Let the adapter do what it is ready for."""
         assert self.process.stdin is not None
         self.process.stdin.write("\n")
         self.process.stdin.flush()
 
+    def repeat(self) -> None:
+        """One repetition, from beginning to end."""
+        self.go_on()
+        self.expect_ready()
+
     def finish(self) -> None:
-        """Read the result."""
+        """Read the result, after the last repetition of everyone: an adapter that ends takes the core from the others."""
+        self.go_on()
         self.answer = json.loads(self.reply())
         with np.load(self.answer["result"]) as arrays:
             self.arrays = dict(arrays)

@@ -3,9 +3,10 @@
 
 The job is the first line of stdin: scene, envs, dt, steps (even), friction, gravity, state (.npz: half [B, 3] m, mass [B] kg,
 pose [E, B, 7] x y z qx qy qz qw, velocity [E, B, 6] linear then angular in world axes), settings, repetitions, result (the
-.npz to write). Before each timed repetition the adapter says "ready" on stdout and waits for a line, so that the caller can
-take turns between several adapters and itself; at the end of stdin nothing is waited for. The last line of stdout is
-{seconds: one a repetition, median, result, versions, info}. The engine's own prints go to stderr.
+.npz to write). Before each timed repetition, and before the result, the adapter says "ready" on stdout and waits for a line,
+so that the caller can take turns between several adapters and itself and none works, or ends, while another is timed; at the
+end of stdin nothing is waited for. The last line of stdout is {seconds: one a repetition, median, result, versions, info}.
+The engine's own prints go to stderr.
 
 The .npz holds start_pose and start_velocity as the engine gives them back, pose and velocity after the last timed
 repetition, and of an untimed run of the same steps: recorded_pose at its end, top [E, B], the largest height of each
@@ -76,14 +77,19 @@ def serve(make: Callable[[Job], Engine], packages: tuple[str, ...]) -> None:
     engine.reset()
     result["start_pose"], result["start_velocity"] = engine.state()
     engine.run()  # warm up
-    seconds = []
-    for _ in range(order["repetitions"]):
+
+    def wait() -> None:
         print("ready", file=replies)
         sys.stdin.readline()
+
+    seconds = []
+    for _ in range(order["repetitions"]):
+        wait()
         engine.reset()
         begin = time.perf_counter()
         engine.run()
         seconds.append(time.perf_counter() - begin)
+    wait()
     result["pose"], result["velocity"] = engine.state()
     np.savez(order["result"], **result)
     answer = {
