@@ -64,7 +64,7 @@ def compared(names: list[str], quick: bool, folder: Path) -> dict[str, Any]:
         return {}
     rows = compare.measure(present, quick, folder)
     print(f"\n{compare.markdown(rows)}")
-    return {"peers": rows}
+    return {"peers": rows, "peers_device": report.processor()}
 
 
 def main() -> None:
