@@ -1,37 +1,97 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks speed|resources [--quick] [--out DIR]"""
+"""python -m benchmarks speed|resources|peers [--help]"""
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
-from . import report, resources, speed
+from . import peers, report, resources, speed
+from .peers import compare
+
+
+def peer_names(text: str) -> list[str]:
+    """'all', 'none' or names with commas between them."""
+    names = {"all": list(peers.PEERS), "none": []}.get(text, text.split(","))
+    for name in names:
+        if name not in peers.PEERS:
+            raise argparse.ArgumentTypeError(f"no peer {name!r}; choose from {', '.join(peers.PEERS)}, or all, or none")
+    return names
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure warp_lcp; results go to a JSON file.")
+    out = argparse.ArgumentParser(add_help=False)
+    out.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder of the JSON file")
+    quick = argparse.ArgumentParser(add_help=False)
+    quick.add_argument("--quick", action="store_true", help="fewer batch sizes and repetitions")
+    place = argparse.ArgumentParser(add_help=False)
+    place.add_argument("--dir", type=Path, default=peers.FOLDER, help="folder of the peers' interpreters")
+    commands = parser.add_subparsers(dest="what", required=True)
+
+    timing = commands.add_parser("speed", parents=[out, quick, place], help="env-steps/s of the paper's box, start-up, peers")
+    timing.add_argument("--device", default=None, help="Warp device (default: Warp's); peers are compared on the CPU")
+    timing.add_argument(
+        "--peers", type=peer_names, default="all", metavar="all|none|NAME,...", help="those that are installed (default: all)"
+    )
+    commands.add_parser("resources", parents=[out], help="what the kernels take of a GPU")
+    others = commands.add_parser("peers", help="other engines on the same scenes").add_subparsers(dest="action", required=True)
+    for action, parents, what in (
+        ("install", [place], "make the interpreters of the peers, with pip"),
+        ("compare", [out, quick, place], "the peers' table of 'speed' alone"),
+    ):
+        sub = others.add_parser(action, parents=parents, help=what)
+        sub.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(peers.PEERS)} (default: all)")
+    found = parser.parse_args()
+    if found.what == "peers":
+        try:
+            found.names = peer_names(",".join(found.names) or "all")
+        except argparse.ArgumentTypeError as error:
+            parser.error(str(error))
+    return found
+
+
+def compared(names: list[str], quick: bool, folder: Path) -> dict[str, Any]:
+    """The comparison with those of the named peers that are installed, printed; {} if none is."""
+    present, absent = peers.split(names, folder)
+    if absent:
+        print(f"\n{absent}")
+    if not present:
+        return {}
+    rows = compare.measure(present, quick, folder)
+    print(f"\n{compare.markdown(rows)}")
+    return {"peers": rows, "peers_device": report.processor()}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure warp_lcp; results go to a JSON file.")
-    parser.add_argument("what", choices=("speed", "resources"))
-    parser.add_argument("--quick", action="store_true", help="fewer batch sizes and repetitions, under 3 minutes")
-    parser.add_argument("--device", default=None, help="Warp device (default: Warp's)")
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder of the JSON file")
-    arguments = parser.parse_args()
+    asked = arguments()
     wp.config.log_level = wp.LOG_WARNING
-    device = wp.get_device(arguments.device)
-    if arguments.what == "speed":
-        rows = speed.measure(device, quick=arguments.quick)
+    if asked.what == "peers" and asked.action == "install":
+        for name in asked.names:
+            peers.PEERS[name].install(asked.dir)
+            print(f"{name}: installed in {asked.dir / name}")
+        return
+    device = wp.get_device(asked.device if asked.what == "speed" else "cpu" if asked.what == "peers" else None)
+    if asked.what == "speed":
+        rows = speed.measure(device, quick=asked.quick)
         start = speed.start_up()
-        text = speed.markdown(rows, start)
+        print(speed.markdown(rows, start))
         data = {"start_up": start, "rows": rows}
+        report.write(asked.out, asked.what, device, data)  # kept if a peer fails
+        data |= compared(asked.peers, asked.quick, asked.dir)
+    elif asked.what == "peers":
+        data = compared(asked.names, asked.quick, asked.dir)
+        if not data:
+            return
     else:
         table = [row for precision in ("float64", "float32") for row in resources.measure(precision)]
-        text = resources.markdown(table)
+        print(resources.markdown(table))
         data = {"rows": [vars(row) for row in table]}
-    print(text)
-    print(f"\nwritten to {report.write(arguments.out, arguments.what, device, json.loads(json.dumps(data)))}")
+    print(f"\nwritten to {report.write(asked.out, asked.what, device, data)}")
 
 
 if __name__ == "__main__":
