@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import warp as wp
-from warp_lcp.kernels import lemke, watch
+from warp_lcp.kernels import lcp, solve_batch, watch
 
 import warp_lcp as wl
 from warp_lcp.methods import METHODS
@@ -49,12 +49,17 @@ def scenes() -> list[wl.Model]:
 
 
 def kernels(precision: str) -> dict[str, wp.Kernel]:
-    """Every kernel of one precision by its name."""
-    found = [lemke.make(PRECISIONS[precision][0]), watch.collect_status]
+    """Every kernel of one precision by its name; those that a method is built into as name[method]."""
+    real = PRECISIONS[precision][0]
+    found = {"collect_status": watch.collect_status}
+    found |= {f"solve_batch[{method}]": solve_batch.make(real, method) for method in solve_batch.SOLVERS}
+    found |= {f"assembled_lcp[{method}]": lcp.make(real, method) for method in ("lemke", "murty", "judice_pires")}
     for model in scenes():
         for method in (m for m in METHODS if precision == "float64" or m != "velocity_pivoting"):
-            found += wl.Simulator(model, method=method, precision=precision, device="cpu").kernels
-    return {kernel.key.split("__")[-1]: kernel for kernel in found}
+            for kernel in wl.Simulator(model, method=method, precision=precision, device="cpu").kernels:
+                if kernel not in found.values():
+                    found[kernel.key.split("__")[-1]] = kernel
+    return found
 
 
 def cuobjdump() -> str:

@@ -14,8 +14,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import lemke as lemke_file
-from . import linear
+from . import linear, problem
+from .solve_batch import solver
 from .types import ITERATION_LIMIT, LANES, scalar_types, sync
 
 
@@ -25,7 +25,7 @@ def functions(real) -> SimpleNamespace:
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     Bodies, Contacts = t.Bodies, t.Contacts
-    LcpWorkspace = lemke_file.functions(real).LcpWorkspace
+    LcpWorkspace = problem.functions(real).LcpWorkspace
     invert = linear.functions(real).invert
 
     @wp.struct
@@ -217,17 +217,20 @@ def functions(real) -> SimpleNamespace:
 
 
 @functools.cache
-def make(real):
-    """Kernel ``lemke_contacts``; launch tiled with dim (P): workspace P serves the environments P, P + num, ..."""
+def make(real, method: str):
+    """Kernel ``assembled_lcp`` for 'lemke', 'murty' or 'judice_pires'.
+
+    Launch tiled with dim (P): workspace P serves the environments P, P + num, ...
+    """
     t = scalar_types(real)
     Bodies, Contacts = t.Bodies, t.Contacts
     f = functions(real)
     ContactWorkspace, assemble, impulses = f.ContactWorkspace, f.assemble, f.impulses
-    g = lemke_file.functions(real)
-    LcpWorkspace, lemke = g.LcpWorkspace, g.lemke
+    LcpWorkspace = problem.functions(real).LcpWorkspace
+    solve = solver(real, method)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
-    def lemke_contacts(
+    def assembled_lcp(
         bodies: Bodies,
         contacts: Contacts,
         unsolved: wp.array(dtype=int),
@@ -244,11 +247,11 @@ def make(real):
                     reason[env] = reason[env] | ITERATION_LIMIT
             elif unsolved[env] != 0 and contacts.count[env] > 0:
                 n = assemble(lcp, ws, bodies, contacts, env, slot, rho_scale, lane)
-                result = lemke(lcp, slot, n, 10 * n + 100, lane)
+                result = solve(lcp, slot, n, 10 * n + 100, lane)
                 impulses(lcp, ws, contacts, env, slot, lane)
                 if lane == 0:
                     iterations[env] = iterations[env] + result[1]
                     reason[env] = reason[env] | result[0]
                 sync()
 
-    return lemke_contacts
+    return assembled_lcp

@@ -7,13 +7,15 @@ read-back), entered in METHODS.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from .errors import WarpLcpError
-from .kernels import lcp, lemke, pgs, pivoting
+from .kernels import lcp, pgs, pivoting, problem
 from .kernels.types import LANES
 from .model import JointType, Model
 
@@ -24,20 +26,24 @@ if TYPE_CHECKING:
 GPU_WORKSPACES = 2048
 #: ... but no more than this many bytes in all.
 GPU_WORKSPACE_BYTES = 2**28
-#: Largest LCP that Lemke's method takes: its tableau grows with the square. Larger problems are left to other methods.
+#: Largest LCP that is assembled: its matrix grows with the square. Larger problems are left to other methods.
 LCP_UNKNOWNS = 2000
 
 
 def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
-    """Workspace of `slots` problems of at most n unknowns for the Lemke kernels."""
-    ws = lemke.functions(real).LcpWorkspace()
+    """Workspace of `slots` plain LCPs of at most n unknowns; bounds other than 0 <= z are the kernel's to write."""
+    ws = problem.functions(real).LcpWorkspace()
     ws.M = wp.empty((slots, n, n), dtype=real, device=device)
-    ws.q = wp.empty((slots, n), dtype=real, device=device)
-    ws.z = wp.empty((slots, n), dtype=real, device=device)
-    ws.tableau = wp.empty((slots, n, n + 2), dtype=real, device=device)
-    ws.scale = wp.empty((slots, n), dtype=real, device=device)
-    ws.basic = wp.empty((slots, n), dtype=int, device=device)
-    ws.nonbasic = wp.empty((slots, n + 1), dtype=int, device=device)
+    ws.system = wp.empty((slots, n, n + 2), dtype=real, device=device)
+    for name in ("q", "z", "x", "w", "row_scale", "column_scale"):
+        setattr(ws, name, wp.empty((slots, n), dtype=real, device=device))
+    for name in ("state", "basic", "wrong", "seen"):
+        setattr(ws, name, wp.empty((slots, n), dtype=int, device=device))
+    for name in ("member", "nonbasic"):
+        setattr(ws, name, wp.empty((slots, n + 1), dtype=int, device=device))
+    ws.lower = wp.zeros((slots, n), dtype=real, device=device)
+    ws.upper = wp.full((slots, n), np.inf, dtype=real, device=device)
+    ws.error = wp.empty((slots, n), dtype=wp.float64, device=device)
     return ws
 
 
@@ -46,11 +52,11 @@ def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
     return 1 if device.is_cpu else max(1, min(num_envs, GPU_WORKSPACES, GPU_WORKSPACE_BYTES // (8 * max(scalars, 1))))
 
 
-class Lemke:
-    """Lemke's method on the assembled LCP of eq. 39, no fallback."""
+class AssembledLCP:
+    """A method for dense LCPs ('lemke', 'murty' or 'judice_pires') on the assembled LCP of eq. 39, no fallback."""
 
-    def __init__(self, model: Model, real: Any):
-        self.kernel = lcp.make(real)
+    def __init__(self, solver: str, model: Model, real: Any):
+        self.kernel = lcp.make(real, solver)
 
     def prepare(self, sim: Simulator) -> None:
         real = sim.real
@@ -124,15 +130,17 @@ class BlockPGS:
 
 #: Methods by the name that users give; each is tried on the environments that those before it left unsolved. Where none
 #: certifies its answer, the best is applied.
-METHODS: dict[str, tuple[type, ...]] = {
-    "auto": (VelocityPivoting, Lemke, BlockPGS),
-    "lemke": (Lemke,),
+METHODS: dict[str, tuple[Callable[[Model, Any], Any], ...]] = {
+    "auto": (VelocityPivoting, partial(AssembledLCP, "lemke"), BlockPGS),
+    "lemke": (partial(AssembledLCP, "lemke"),),
     "velocity_pivoting": (VelocityPivoting,),
     "pgs": (BlockPGS,),
+    "murty": (partial(AssembledLCP, "murty"),),
+    "judice_pires": (partial(AssembledLCP, "judice_pires"),),
 }
 
 
-def chosen(name: str, precision: str) -> tuple[type, ...]:
+def chosen(name: str, precision: str) -> tuple[Callable[[Model, Any], Any], ...]:
     """The methods behind a name.
 
     float32 does not resolve the stiffness of Table 1: a velocity of 5 m/s is known to 5e-7 m/s, and over eps_n that is
