@@ -16,6 +16,9 @@ from . import problem
 from .problem import BETWEEN, LOWER
 from .types import ITERATION_LIMIT, RAY, sync
 
+# Covering vectors that are tried one after the other.
+COVERS = 3
+
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
@@ -107,24 +110,27 @@ def functions(real) -> SimpleNamespace:
         return best
 
     @wp.func
-    def load(ws: LcpWorkspace, slot: int, n: int, ones: bool, lane: int):
+    def load(ws: LcpWorkspace, slot: int, n: int, cover: int, lane: int):
         """Equilibrated tableau of the start basis w: x_basic = T[:, :n + 1] x_nonbasic + T[:, n + 1].
 
-        The covering vector, column n, is the sum of sizes of each row, or ones.
+        The covering vector, column n, is the sum of sizes of each row (0), or ones (1), or numbers from 1 to 2 (2).
         """
         for i in range(lane, n, wp.block_dim()):
             total = real(0.0)
             for j in range(n):
-                total += ws.row_scale[slot, i] * wp.abs(ws.M[slot, i, j]) * ws.column_scale[slot, j]
-            ws.system[slot, i, n] = wp.where(ones or total == real(0.0), real(1.0), total)
+                entry = ws.row_scale[slot, i] * ws.M[slot, i, j] * ws.column_scale[slot, j]
+                ws.system[slot, i, j] = entry
+                total += wp.abs(entry)
+            if cover == 1 or total == real(0.0):
+                total = real(1.0)
+            elif cover == 2:
+                total = real(1.0) + real(i) / real(n)
+            ws.system[slot, i, n] = total
             ws.system[slot, i, n + 1] = ws.row_scale[slot, i] * ws.q[slot, i]
             ws.basic[slot, i] = i
             ws.nonbasic[slot, i] = n + i
         if lane == 0:
             ws.nonbasic[slot, n] = 2 * n
-        for i in range(n):
-            for j in range(lane, n, wp.block_dim()):
-                ws.system[slot, i, j] = ws.row_scale[slot, i] * ws.M[slot, i, j] * ws.column_scale[slot, j]
         sync()
 
     @wp.func
@@ -158,9 +164,9 @@ def functions(real) -> SimpleNamespace:
         sync()
 
     @wp.func
-    def follow(ws: LcpWorkspace, slot: int, n: int, ones: bool, limit: int, lane: int) -> wp.vec2i:
+    def follow(ws: LcpWorkspace, slot: int, n: int, cover: int, limit: int, lane: int) -> wp.vec2i:
         """Follow the path of one covering vector to its end, z to ws.z; returns (status bits, pivots)."""
-        load(ws, slot, n, ones, lane)
+        load(ws, slot, n, cover, lane)
         row = int(0)
         size = real(0.0)
         for i in range(n):
@@ -202,11 +208,17 @@ def functions(real) -> SimpleNamespace:
     def lemke(ws: LcpWorkspace, slot: int, n: int, limit: int, lane: int) -> wp.vec2i:
         """Solve the plain LCP in ws.M, ws.q into ws.z; returns (status bits, pivots)."""
         equilibrate(ws, slot, n, lane)
-        result = follow(ws, slot, n, False, limit, lane)
-        if result[0] != 0 or violation(ws, slot, n, lane) > acceptable:
+        status = int(0)
+        pivots = int(0)
+        cover = int(0)
+        while cover < COVERS:
+            result = follow(ws, slot, n, cover, limit, lane)
+            status = result[0]
+            pivots += result[1]
+            cover += 1
+            if status == 0 and violation(ws, slot, n, lane) <= acceptable:
+                cover = COVERS
             sync()
-            again = follow(ws, slot, n, True, limit, lane)
-            result = wp.vec2i(again[0], result[1] + again[1])
-        return result
+        return wp.vec2i(status, pivots)
 
     return SimpleNamespace(lemke=lemke)

@@ -46,34 +46,27 @@ def functions(real) -> SimpleNamespace:
         error: wp.array2d(dtype=wp.float64)  # [P, n] natural residual of each row
 
     @wp.func
+    def power_of_two(size: real) -> real:
+        """About 1 / sqrt(size); 1 for zero."""
+        scale = real(1.0)
+        if size > real(0.0):
+            scale = wp.pow(real(2.0), wp.round(real(-0.5) * wp.log2(size)))
+        return scale
+
+    @wp.func
     def equilibrate(ws: LcpWorkspace, slot: int, n: int, lane: int):
-        """Scales of rows and columns that bring the largest entry of each near 1: two sweeps of Ruiz's method (2001).
+        """Scales of rows and columns that bring the largest entry of each near 1: one sweep of Ruiz's method (2001).
 
         Positive scales of w and z keep the problem. Powers of two, so that scaling does not round.
         """
         for i in range(lane, n, wp.block_dim()):
-            ws.row_scale[slot, i] = real(1.0)
-            ws.column_scale[slot, i] = real(1.0)
-        sync()
-        for _sweep in range(2):
-            for i in range(lane, n, wp.block_dim()):
-                row = real(0.0)
-                column = real(0.0)
-                for j in range(n):
-                    row = wp.max(row, wp.abs(ws.M[slot, i, j]) * ws.column_scale[slot, j])
-                    column = wp.max(column, wp.abs(ws.M[slot, j, i]) * ws.row_scale[slot, j])
-                ws.x[slot, i] = row * ws.row_scale[slot, i]
-                ws.w[slot, i] = column * ws.column_scale[slot, i]
-            sync()
-            for i in range(lane, n, wp.block_dim()):
-                if ws.x[slot, i] > real(0.0):
-                    ws.row_scale[slot, i] = ws.row_scale[slot, i] / wp.sqrt(ws.x[slot, i])
-                if ws.w[slot, i] > real(0.0):
-                    ws.column_scale[slot, i] = ws.column_scale[slot, i] / wp.sqrt(ws.w[slot, i])
-            sync()
-        for i in range(lane, n, wp.block_dim()):
-            ws.row_scale[slot, i] = wp.pow(real(2.0), wp.round(wp.log2(ws.row_scale[slot, i])))
-            ws.column_scale[slot, i] = wp.pow(real(2.0), wp.round(wp.log2(ws.column_scale[slot, i])))
+            row = real(0.0)
+            column = real(0.0)
+            for j in range(n):
+                row = wp.max(row, wp.abs(ws.M[slot, i, j]))
+                column = wp.max(column, wp.abs(ws.M[slot, j, i]))
+            ws.row_scale[slot, i] = power_of_two(row)
+            ws.column_scale[slot, i] = power_of_two(column)
         sync()
 
     @wp.func

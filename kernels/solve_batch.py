@@ -77,6 +77,8 @@ def make(real, method: str):
             if wp.isfinite(upper[b % upper.shape[0], i]):
                 total += 1
         for i in range(lane, total, wp.block_dim()):
+            ws.lower[slot, i] = real(0.0)  # another method may have left bounds there
+            ws.upper[slot, i] = real(wp.inf)
             for j in range(total):
                 ws.M[slot, i, j] = real(0.0)
         sync()

@@ -283,6 +283,16 @@ def test_never_a_wrong_ok(method, precision):
         assert not ok.all() or upper < np.inf
 
 
+def test_auto_solves_what_its_methods_solve():
+    """The methods share a workspace and must not see what another left there; matrices of no special kind, in a box."""
+    rng = np.random.default_rng(8)
+    M, q = rng.normal(size=(300, 7, 7)), rng.normal(size=(300, 7))
+    solved = {name: solve(M, q, name, lower=-1.0, upper=2.0)[1].status.numpy() == 0 for name in METHODS}
+    assert (~solved["judice_pires"] & solved["lemke"]).any()
+    assert solved["auto"][solved["lemke"]].all()
+    assert np.count_nonzero(solved["auto"]) >= 290
+
+
 def test_an_overflow_is_no_solution():
     """z = 1e400 is not a number that float64 has; the neighbour is solved."""
     for method in METHODS:

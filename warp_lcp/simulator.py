@@ -78,8 +78,9 @@ class Simulator:
         num_envs: number of environments E.
         dt: step size h [s].
         formulation: contact law, see docs/theory.md.
-        method: how the contact problem is solved: 'lemke', 'velocity_pivoting', 'pgs', or 'auto': velocity pivoting, then
-            Lemke's method, then pgs for the environments that are not solved by then (in float32: pgs alone).
+        method: how the contact problem is solved: 'lemke', 'velocity_pivoting', 'pgs', 'murty', 'judice_pires', or 'auto':
+            velocity pivoting, then Lemke's method, then pgs for the environments that are not solved by then (in float32:
+            pgs alone).
         sliding: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes throughout).
         directions: k, friction directions of a sticking contact, at least 2.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
