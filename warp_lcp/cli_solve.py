@@ -110,10 +110,10 @@ def read(file: str) -> tuple[str, dict[str, np.ndarray]]:
     if not path.is_file():
         raise WarpLcpError(f"{file}: no such file; give an .npz file with {kinds}")
     try:
-        stored = np.load(path)
-        if not isinstance(stored, np.lib.npyio.NpzFile):
-            raise ValueError("it holds a single array")
-        with stored:
+        with path.open("rb") as stream:  # np.load leaves a file open that it cannot read
+            stored = np.load(stream)
+            if not isinstance(stored, np.lib.npyio.NpzFile):
+                raise ValueError("it holds a single array")
             for name, kind in KINDS.items():
                 if set(kind.keys) <= set(stored.files):
                     return name, {key: stored[key] for key in (*kind.keys, *kind.optional) if key in stored.files}
