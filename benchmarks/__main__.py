@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks speed|resources|peers [--help]"""
+"""python -m benchmarks speed|resources|lcp|peers [--help]"""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from . import peers, report, resources, speed
+from . import lcp, peers, report, resources, speed
 from .peers import compare
 
 
@@ -38,6 +38,8 @@ def arguments() -> argparse.Namespace:
     timing.add_argument(
         "--peers", type=peer_names, default="all", metavar="all|none|NAME,...", help="those that are installed (default: all)"
     )
+    recorded = commands.add_parser("lcp", parents=[out, quick], help="every method for LCPs on recorded problems")
+    recorded.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
     commands.add_parser("resources", parents=[out], help="what the kernels take of a GPU")
     others = commands.add_parser("peers", help="other engines on the same scenes").add_subparsers(dest="action", required=True)
     for action, parents, what in (
@@ -87,6 +89,13 @@ def main() -> None:
         data = compared(asked.names, asked.quick, asked.dir)
         if not data:
             return
+    elif asked.what == "lcp":
+        try:
+            rows = lcp.measure(device, asked.problems, quick=asked.quick)
+        except FileNotFoundError as error:
+            raise SystemExit(f"python -m benchmarks: error: {error}") from error
+        print(lcp.markdown(rows))
+        data = {"rows": rows}
     else:
         table = [row for precision in ("float64", "float32") for row in resources.measure(precision)]
         print(resources.markdown(table))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: ``warp-lcp info SCENE`` says what is in a scene, ``warp-lcp run SCENE`` simulates it.
+"""The command line: ``warp-lcp info SCENE`` says what is in a scene, ``run SCENE`` simulates it, ``solve FILE`` solves problems.
 
 Bad input ends with one line on stderr and exit status 2. What is slow to import (warp, USD, rerun, rich) is imported
 where it is needed, so that ``--help`` and a mistyped option answer at once.
@@ -85,7 +85,18 @@ def _parser() -> _Parser:
     )
     add("--rerun", metavar="SINK", help="stream to a file ending in .rrd, 'spawn', 'serve' or the URL of a viewer")
     add("--out", metavar="FILE.npz", help="write time, poses, velocities, status, residual and iterations")
+    from .cli_solve import add_arguments
+
+    solve = commands.add_parser("solve", help="solve complementarity problems from a file", allow_abbrev=False)
+    solve.set_defaults(action=_solve)
+    add_arguments(solve)
     return parser
+
+
+def _solve(arguments: argparse.Namespace) -> int:
+    from .cli_solve import run
+
+    return run(arguments)
 
 
 # ----------------------------------------------------------------------------------------------------------------- info
@@ -304,16 +315,21 @@ def _start_warp() -> None:
                 print(line, file=sys.stderr)
 
 
-def _simulator(model: Model, arguments: argparse.Namespace) -> Simulator:
+def _device(name: str | None) -> Any:
+    """The Warp device of --device."""
     import warp as wp
 
-    names = ("dt", "formulation", "method", "sliding", "directions", "rho_scale", "precision", "integrator")
-    options = {name: getattr(arguments, name) for name in names}
     aliases = ["cuda"] if wp.get_cuda_device_count() else []  # the current one; asking for it without any makes Warp chatter
     devices = [*(str(d) for d in wp.get_devices()), *aliases]
-    if arguments.device not in (None, *devices):
-        raise WarpLcpError(f"--device {arguments.device}: there is no such device; choose from: {', '.join(devices)}")
-    device = wp.get_device(arguments.device)
+    if name not in (None, *devices):
+        raise WarpLcpError(f"--device {name}: there is no such device; choose from: {', '.join(devices)}")
+    return wp.get_device(name)
+
+
+def _simulator(model: Model, arguments: argparse.Namespace) -> Simulator:
+    names = ("dt", "formulation", "method", "sliding", "directions", "rho_scale", "precision", "integrator")
+    options = {name: getattr(arguments, name) for name in names}
+    device = _device(arguments.device)
     needed, there = arguments.envs * bytes_per_env(model), _memory() if device.is_cpu else device.free_memory
     if needed > there:
         raise WarpLcpError(f"--envs {arguments.envs} takes {needed / 1e9:.3g} GB, {device} has {there / 1e9:.3g} GB; give fewer")

@@ -7,14 +7,17 @@ read-back), entered in METHODS.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from .errors import WarpLcpError
-from .kernels import lcp, lemke, pgs, pivoting, problems, proximal
+from .kernels import contact_problem, lcp, pgs, pivoting, problem, proximal
 from .kernels.types import LANES, scalar_types
+from .laws import Law
 from .model import JointType, Model
 
 if TYPE_CHECKING:
@@ -24,20 +27,24 @@ if TYPE_CHECKING:
 GPU_WORKSPACES = 2048
 #: ... but no more than this many bytes in all.
 GPU_WORKSPACE_BYTES = 2**28
-#: Largest LCP that Lemke's method takes: its tableau grows with the square. Larger problems are left to other methods.
+#: Largest LCP that is assembled: its matrix grows with the square. Larger problems are left to other methods.
 LCP_UNKNOWNS = 2000
 
 
 def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
-    """Workspace of `slots` problems of at most n unknowns for the Lemke kernels."""
-    ws = lemke.functions(real).LcpWorkspace()
+    """Workspace of `slots` plain LCPs of at most n unknowns; bounds other than 0 <= z are the kernel's to write."""
+    ws = problem.functions(real).LcpWorkspace()
     ws.M = wp.empty((slots, n, n), dtype=real, device=device)
-    ws.q = wp.empty((slots, n), dtype=real, device=device)
-    ws.z = wp.empty((slots, n), dtype=real, device=device)
-    ws.tableau = wp.empty((slots, n, n + 2), dtype=real, device=device)
-    ws.scale = wp.empty((slots, n), dtype=real, device=device)
-    ws.basic = wp.empty((slots, n), dtype=int, device=device)
-    ws.nonbasic = wp.empty((slots, n + 1), dtype=int, device=device)
+    ws.system = wp.empty((slots, n, n + 2), dtype=real, device=device)
+    for name in ("q", "z", "x", "w", "row_scale", "column_scale"):
+        setattr(ws, name, wp.empty((slots, n), dtype=real, device=device))
+    for name in ("state", "basic", "wrong", "seen"):
+        setattr(ws, name, wp.empty((slots, n), dtype=int, device=device))
+    for name in ("member", "nonbasic"):
+        setattr(ws, name, wp.empty((slots, n + 1), dtype=int, device=device))
+    ws.lower = wp.zeros((slots, n), dtype=real, device=device)
+    ws.upper = wp.full((slots, n), np.inf, dtype=real, device=device)
+    ws.error = wp.empty((slots, n), dtype=wp.float64, device=device)
     return ws
 
 
@@ -70,16 +77,16 @@ def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
     return 1 if device.is_cpu else max(1, min(num_envs, GPU_WORKSPACES, GPU_WORKSPACE_BYTES // (8 * max(scalars, 1))))
 
 
-class Lemke:
-    """Lemke's method on the assembled LCP of eq. 39, no fallback."""
+class AssembledLCP:
+    """A method for dense LCPs ('lemke', 'murty' or 'judice_pires') on the assembled LCP of eq. 39, no fallback."""
 
-    def __init__(self, model: Model, real: Any):
-        self.kernel = lcp.make(real)
+    def __init__(self, solver: str, model: Model, real: Any, law: Law):
+        self.kernel = lcp.make(real, solver, law.has_generators)
 
     def prepare(self, sim: Simulator) -> None:
         real = sim.real
-        r = min(sim.model.max_contacts, LCP_UNKNOWNS // (1 + 2 * sim.directions))
-        n = r * (1 + 2 * sim.directions)
+        r = min(sim.model.max_contacts, LCP_UNKNOWNS // sim.law.unknowns)
+        n = r * sim.law.unknowns
         slots = workspaces(sim.num_envs, 2 * n * n + 15 * r * r, sim.device)
         self.lcp = lcp_workspace(real, slots, n, sim.device)
         ws = lcp.functions(real).ContactWorkspace()
@@ -104,8 +111,8 @@ class ProximalNewton:
     #: Room for coupled contacts and for blocks of a factor, per contact.
     NEIGHBOURS, FILL = 128, 256
 
-    def __init__(self, model: Model, real: Any):
-        self.kernel = problems.make_contacts(real)
+    def __init__(self, model: Model, real: Any, law: Law):
+        self.kernel = contact_problem.make_contacts(real)
 
     def prepare(self, sim: Simulator) -> None:
         n = sim.model.max_contacts
@@ -124,7 +131,7 @@ class VelocityPivoting:
 
     LIMIT = 12
 
-    def __init__(self, model: Model, real: Any):
+    def __init__(self, model: Model, real: Any, law: Law):
         self.movable = np.flatnonzero(model.joint_type == JointType.FREE)
         self.single = len(self.movable) == 1
         self.kernel = pivoting.make_single(real) if self.single else pivoting.make(real).pivot
@@ -155,7 +162,7 @@ class BlockPGS:
 
     SWEEPS = 50
 
-    def __init__(self, model: Model, real: Any):
+    def __init__(self, model: Model, real: Any, law: Law):
         self.kernel = pgs.make(real)
 
     def prepare(self, sim: Simulator) -> None:
@@ -169,28 +176,41 @@ class BlockPGS:
         )
 
 
+#: Methods that want the law as an LCP.
+LCP_METHODS = ("lemke", "murty", "judice_pires")
+
 #: Methods by the name that users give; each is tried on the environments that those before it left unsolved. Where none
 #: certifies its answer, the best is applied.
-METHODS: dict[str, tuple[type, ...]] = {
+METHODS: dict[str, tuple[Callable[[Model, Any, Law], Any], ...]] = {
     "auto": (VelocityPivoting, ProximalNewton, BlockPGS),
-    "lemke": (Lemke,),
     "velocity_pivoting": (VelocityPivoting,),
     "proximal_newton": (ProximalNewton,),
     "pgs": (BlockPGS,),
+    **{name: (partial(AssembledLCP, name),) for name in LCP_METHODS},
 }
 
 
-def chosen(name: str, precision: str) -> tuple[type, ...]:
-    """The methods behind a name.
+def chosen(name: str, precision: str, law: Law) -> tuple[Callable[[Model, Any, Law], Any], ...]:
+    """The methods behind a name, for a precision and a law.
 
     float32 does not resolve the stiffness of Table 1: a velocity of 5 m/s is known to 5e-7 m/s, and over eps_n that is
     more than the impulse itself. Block PGS does not divide by eps, so it is what 'auto' means there.
 
     Raises:
-        WarpLcpError: for velocity pivoting in float32.
+        WarpLcpError: where the method does not take the law, or not in this precision.
     """
-    if precision == "float32" and name == "auto":
-        return (BlockPGS,)
-    if precision == "float32" and name == "velocity_pivoting":
-        raise WarpLcpError("method 'velocity_pivoting' needs precision 'float64': float32 does not resolve contact stiffness; choose 'pgs'")
+    if name == "auto":
+        if precision == "float32":
+            return (BlockPGS,)
+        return METHODS["auto"] if law.has_axes else METHODS["auto"][1:]
+    if name == "velocity_pivoting":
+        if precision == "float32":
+            raise WarpLcpError(f"method {name!r} needs precision 'float64': float32 does not resolve contact stiffness; choose 'pgs'")
+        if not law.has_axes:
+            what = law.formulation if law.has_generators else f"directions = {law.directions}"
+            raise WarpLcpError(
+                f"method {name!r} takes two friction axes or Coulomb's cone, not {what}; choose auto, proximal_newton or lemke"
+            )
+    if law.is_cone and name in LCP_METHODS:
+        raise WarpLcpError(f"method {name!r} solves LCPs, and the cone of 'coulomb' is none; choose auto, proximal_newton or pgs")
     return METHODS[name]

@@ -15,12 +15,11 @@ import warp as wp
 from .errors import SimulationError, WarpLcpError
 from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset
 from .kernels.types import scalar_types
+from .laws import FORMULATIONS, SLIDING, Law
 from .methods import METHODS, chosen
 from .model import Model, ShapeType
 from .rollout import Recorder, Rollout
 
-FORMULATIONS = ("phantom_inertia", "anitescu_potra", "box", "hybrid", "coulomb")
-SLIDING = ("regularized", "aligned", "facets")
 INTEGRATORS = ("euler", "midpoint")
 PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.float32)}
 #: Parameters that may differ between environments, and what their numbers must be.
@@ -82,8 +81,9 @@ class Simulator:
         num_envs: number of environments E.
         dt: step size h [s].
         formulation: contact law, see docs/theory.md.
-        method: how the contact problem is solved: 'lemke', 'velocity_pivoting', 'pgs', or 'auto': velocity pivoting, then
-            Lemke's method, then pgs for the environments that are not solved by then (in float32: pgs alone).
+        method: how the contact problem is solved: 'lemke', 'velocity_pivoting', 'pgs', 'murty', 'judice_pires', or 'auto':
+            velocity pivoting, then Lemke's method, then pgs for the environments that are not solved by then (in float32:
+            pgs alone).
         sliding: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes throughout).
         directions: k, friction directions of a sticking contact, at least 2.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
@@ -140,7 +140,7 @@ class Simulator:
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
         self.directions, self.rho_scale, self.strict = int(directions), float(rho_scale), bool(strict)
-        self._law = _law(formulation, sliding, self.directions)
+        self.law = Law(formulation, sliding, self.directions)
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
         self.tolerance = TOLERANCE
@@ -311,7 +311,7 @@ class Simulator:
         self.unsolved.fill_(1)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
-        rows = [*scene, self.bodies, self.slots, h, *self._law, self.rows]
+        rows = [*scene, self.bodies, self.slots, h, *self.law.row_arguments, self.rows]
         self.launch(k.contact_rows, rows, self.model.max_contacts)
         for i, method in enumerate(self._methods):
             method.launch(self)
@@ -399,7 +399,7 @@ class Simulator:
         rows.point, rows.inv_mass, rows.relaxation, rows.shift, rows.free, rows.impulse, rows.velocity, rows.best_impulse = (
             self._array(r, t.vec3) for _ in range(8)
         )
-        rows.slip = self._array(r if self.formulation == "coulomb" else 0, t.vec3)
+        rows.slip = self._array(r if self.law.is_cone else 0, t.vec3)
         rows.gap, rows.damping = self._array(r, self.real), self._array(r, self.real)
         rows.frame, rows.mu, rows.bound = self._array(r, t.mat33), self._array(r, t.vec2), self._array(r, t.vec2)
 
@@ -413,7 +413,7 @@ class Simulator:
 
     def _load_kernels(self) -> None:
         self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator)
-        self._methods = [method(self.model, self.real) for method in chosen(self.method, self.precision)]
+        self._methods = [method(self.model, self.real, self.law) for method in chosen(self.method, self.precision, self.law)]
         for method in self._methods:
             method.prepare(self)
         pair_kernels = [kernel for kernel, *_ in self._pair_kernels]
@@ -449,24 +449,14 @@ def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNames
     return stages, pairs
 
 
-def kernel_names(model: Model, method: str = "auto", precision: str = "float64", integrator: str = "euler") -> list[str]:
+def kernel_names(
+    model: Model, method: str = "auto", precision: str = "float64", law: Law | None = None, integrator: str = "euler"
+) -> list[str]:
     """Names of the kernels that a Simulator of the model compiles."""
-    real = PRECISIONS[precision][0]
+    real, law = PRECISIONS[precision][0], law or Law()
     stages, pairs = stage_kernels(model, real, integrator)
-    solvers = [kind(model, real).kernel for kind in chosen(method, precision)]
+    solvers = [kind(model, real, law).kernel for kind in chosen(method, precision, law)]
     return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *(k for k, *_ in pairs), *solvers)]
-
-
-def _law(formulation: str, sliding: str, directions: int) -> tuple[int, int, int]:
-    """What kernels/contacts.py needs to know of a contact law: (sliding, directions of a sticking contact, frozen limits?)."""
-    fixed = SLIDING.index("facets")
-    return {
-        "phantom_inertia": (SLIDING.index(sliding), directions, 0),
-        "anitescu_potra": (fixed, -directions, 0),
-        "box": (fixed, directions, 1),
-        "hybrid": (SLIDING.index("regularized"), directions, 1),
-        "coulomb": (len(SLIDING), 1, 0),
-    }[formulation]
 
 
 def _choice(what: str, value: str, choices: tuple[str, ...]) -> None:
