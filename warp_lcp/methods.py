@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from .errors import WarpLcpError
-from .kernels import contact_problem, lcp, pgs, pivoting, problem, proximal
+from .kernels import contact_problem, lcp, pgs, pivoting, problem, proximal, sparse
 from .kernels.types import LANES, scalar_types
 from .laws import Law
 from .model import JointType, Model
@@ -48,28 +48,37 @@ def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
     return ws
 
 
-def contact_workspace(real: Any, slots: int, n: int, blocks: int, fill: int, device: Any) -> tuple[Any, Any]:
-    """Graph and ContactProblem of `slots` problems of at most n contacts, for the proximal kernels.
+def graph_workspace(real: Any, size: int, slots: int, n: int, blocks: int, fill: int, device: Any) -> Any:
+    """Graph of `slots` block-sparse systems of at most n nodes, blocks of size x size (kernels/sparse.py).
 
-    blocks: room for pairs of contacts that share a body, each counted twice; fill: room for blocks of a triangular factor.
+    blocks: room for pairs of neighbours, each counted twice; fill: room for blocks of a triangular factor.
     """
-    t, f = scalar_types(real), proximal.functions(real)
-    graph, problem = f.Graph(), f.ContactProblem()
+    graph = sparse.functions(real, size).Graph()
+    matrix = graph._cls.vars["pivot"].type.dtype
 
     def empty(n: int, dtype: Any) -> wp.array:
         return wp.empty((slots, max(n, 1)), dtype=dtype, device=device)
 
-    graph.adjacent = wp.empty((slots, n, (n + 31) // 32), dtype=wp.uint32, device=device)
+    graph.adjacent = wp.empty((slots, max(n, 1), (n + 31) // 32), dtype=wp.uint32, device=device)
     graph.degree, graph.order, graph.step = (empty(n, int) for _ in range(3))
     graph.row, graph.fill = empty(n + 1, int), empty(n + 1, int)
     graph.column, graph.target, graph.later = empty(blocks, int), empty(blocks, int), empty(fill, int)
-    graph.diagonal, graph.pivot = empty(n, t.mat33), empty(n, t.mat33)
-    graph.block, graph.lower, graph.upper = empty(blocks, t.mat33), empty(fill, t.mat33), empty(fill, t.mat33)
-    problem.free, problem.rho, problem.impulse, problem.velocity = (empty(n, t.vec3) for _ in range(4))
-    problem.centre, problem.best, problem.step, problem.change = (empty(n, t.vec3) for _ in range(4))
-    problem.mu, problem.bound = empty(n, t.vec2), empty(n, t.vec2)
-    problem.directions, problem.error = empty(n, int), empty(n, real)
-    return graph, problem
+    graph.diagonal, graph.pivot = empty(n, matrix), empty(n, matrix)
+    graph.block, graph.lower, graph.upper = empty(blocks, matrix), empty(fill, matrix), empty(fill, matrix)
+    return graph
+
+
+def contact_workspace(real: Any, slots: int, n: int, blocks: int, fill: int, device: Any) -> tuple[Any, Any]:
+    """Graph and ContactProblem of `slots` problems of at most n contacts, for the proximal kernels."""
+    t, problem = scalar_types(real), proximal.functions(real).ContactProblem()
+
+    def empty(dtype: Any) -> wp.array:
+        return wp.empty((slots, max(n, 1)), dtype=dtype, device=device)
+
+    problem.free, problem.rho, problem.impulse, problem.velocity = (empty(t.vec3) for _ in range(4))
+    problem.centre, problem.best, problem.step, problem.change = (empty(t.vec3) for _ in range(4))
+    problem.mu, problem.bound, problem.directions, problem.error = empty(t.vec2), empty(t.vec2), empty(int), empty(real)
+    return graph_workspace(real, 3, slots, n, blocks, fill, device), problem
 
 
 def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
@@ -127,25 +136,41 @@ class ProximalNewton:
 
 
 class VelocityPivoting:
-    """Principal pivoting on contact states in the velocities; contacts with more than two directions are not for it."""
+    """Principal pivoting on contact states in the velocities, for laws with two friction axes or a disc."""
 
     LIMIT = 12
+    #: Room for neighbours and for blocks of a triangular factor, per body.
+    NEIGHBOURS, FILL = 32, 64
 
     def __init__(self, model: Model, real: Any, law: Law):
         self.movable = np.flatnonzero(model.joint_type == JointType.FREE)
         self.single = len(self.movable) == 1
-        self.kernel = pivoting.make_single(real) if self.single else pivoting.make(real).pivot
+        kind = (real, law.is_cone, law.has_frozen_limits)
+        self.parts = None if self.single else pivoting.make(*kind)
+        self.kernel = pivoting.make_single(*kind) if self.parts is None else self.parts.pivot
 
     def prepare(self, sim: Simulator) -> None:
-        if self.single:
+        if self.parts is None:
             return
-        n = sim.model.dofs
-        self.slots = workspaces(sim.num_envs, n * n, sim.device)
-        ws = self.workspace = pivoting.make(sim.real).Workspace()
-        ws.system = wp.empty((self.slots, n, n + 1), dtype=sim.real, device=sim.device)
-        start = np.full(sim.model.num_bodies, -1, dtype=np.int32)
-        start[self.movable] = 6 * np.arange(len(self.movable))
-        ws.start = wp.array(start, dtype=int, device=sim.device)
+        n, contacts = len(self.movable), sim.model.max_contacts
+        blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
+        self.slots = workspaces(sim.num_envs, 72 * (n + fill) + 14 * contacts, sim.device)
+        self.graph = graph_workspace(sim.real, 6, self.slots, n, blocks, fill, sim.device)
+        ws = self.workspace = self.parts.Workspace()
+        number = np.full(sim.model.num_bodies, -1, dtype=np.int32)
+        number[self.movable] = np.arange(n)
+        ws.number = wp.array(number, dtype=int, device=sim.device)
+        ws.body = wp.array(self.movable.astype(np.int32), dtype=int, device=sim.device)
+        t, vec6 = scalar_types(sim.real), wp.types.vector(length=6, dtype=sim.real)
+        for name, width, dtype in (
+            ("begin", n + 1, int),
+            ("contact", 2 * contacts, int),
+            ("matrix", contacts, t.mat33),
+            ("shift", contacts, t.vec3),
+            ("change", n, vec6),
+            ("scratch", n, vec6),
+        ):
+            setattr(ws, name, wp.empty((self.slots, max(width, 1)), dtype=dtype, device=sim.device))
         ws.flips = wp.zeros(self.slots, dtype=int, device=sim.device)
 
     def launch(self, sim: Simulator) -> None:
@@ -153,7 +178,7 @@ class VelocityPivoting:
         if self.single:
             sim.launch(self.kernel, [sim.bodies, int(self.movable[0]), sim.rows, *tail])
         else:
-            inputs = [sim.bodies, sim.rows, self.workspace, *tail]
+            inputs = [sim.bodies, sim.rows, self.graph, self.workspace, *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
