@@ -219,18 +219,16 @@ def chosen(name: str, precision: str, law: Law) -> tuple[Callable[[Model, Any, L
     """The methods behind a name, for a precision and a law.
 
     float32 does not resolve the stiffness of Table 1: a velocity of 5 m/s is known to 5e-7 m/s, and over eps_n that is
-    more than the impulse itself. Block PGS does not divide by eps, so it is what 'auto' means there.
+    more than the impulse itself. The proximal method and block PGS do not divide by eps, so they are what 'auto' means there.
 
     Raises:
         WarpLcpError: where the method does not take the law, or not in this precision.
     """
     if name == "auto":
-        if precision == "float32":
-            return (BlockPGS,)
-        return METHODS["auto"] if law.has_axes else METHODS["auto"][1:]
+        return METHODS["auto"] if law.has_axes and precision == "float64" else METHODS["auto"][1:]
     if name == "velocity_pivoting":
         if precision == "float32":
-            raise WarpLcpError(f"method {name!r} needs precision 'float64': float32 does not resolve contact stiffness; choose 'pgs'")
+            raise WarpLcpError(f"method {name!r} needs precision 'float64': float32 does not resolve contact stiffness; choose 'auto'")
         if not law.has_axes:
             what = law.formulation if law.has_generators else f"directions = {law.directions}"
             raise WarpLcpError(

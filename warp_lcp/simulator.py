@@ -80,10 +80,10 @@ class Simulator:
         model: the scene.
         num_envs: number of environments E.
         dt: step size h [s].
-        formulation: contact law, see docs/theory.md.
-        method: how the contact problem is solved: 'lemke', 'velocity_pivoting', 'pgs', 'murty', 'judice_pires', or 'auto':
-            velocity pivoting, then Lemke's method, then pgs for the environments that are not solved by then (in float32:
-            pgs alone).
+        formulation: contact law, see docs/theory.md: 'phantom_inertia', 'anitescu_potra', 'box', 'hybrid' or 'coulomb' (the exact cone).
+        method: how the contact problem is solved: 'velocity_pivoting', 'proximal_newton', 'pgs', 'lemke', 'murty', 'judice_pires', or
+            'auto': velocity pivoting where the law has axes (not in float32), then the proximal Newton method, then pgs, each for
+            the environments that are not solved by then.
         sliding: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes throughout).
         directions: k, friction directions of a sticking contact, at least 2.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
@@ -150,6 +150,7 @@ class Simulator:
         self._allocate()
         self._load_kernels()
         self._graphs: dict[str, Any] = {}
+        self._combine_pairs()
         self._recorder: Recorder | None = None
         self.time = 0.0
         self.last_count = 0
@@ -241,6 +242,17 @@ class Simulator:
             else:
                 setattr(self.parameters, name, self._constant(value, present.dtype))
                 self._graphs.clear()  # they hold the address of the old array
+        self._combine_pairs()
+
+    def _combine_pairs(self) -> None:
+        """Friction and contact parameters of the pairs, from those of their shapes and bodies."""
+        p, t, pairs = self.parameters, self._types, len(self.model.pairs)
+        rows = max(p.mass.shape[0], p.friction.shape[0], p.contact.shape[0])
+        if p.pair_contact is None or p.pair_contact.shape != (rows, pairs):
+            p.pair_friction = wp.empty((rows, pairs), dtype=t.vec2, device=self.device)
+            p.pair_contact = wp.empty((rows, pairs), dtype=t.vec5, device=self.device)
+            self._graphs.clear()
+        wp.launch(self._kernels.combine_pairs, dim=(rows, pairs), inputs=[self.topology, p], device=self.device)
 
     def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
         if name not in PARAMETERS:
@@ -369,6 +381,8 @@ class Simulator:
         topology.shape_size = self._constant(m.shape_size, t.vec3)
         topology.surface_velocity = self._constant(m.shape_surface_velocity, t.vec3)
         topology.pairs, topology.pair_slots = ints(m.pairs), ints(m.pair_slots)
+        pair_body = np.where(m.pairs >= 0, m.shape_body[m.pairs], -1) if len(m.pairs) else np.zeros((0, 2))
+        topology.pair_body = wp.array(pair_body.astype(np.int32), dtype=wp.vec2i, device=self.device)
         topology.slot_pair = ints(np.repeat(np.arange(len(m.pairs)), np.diff(m.pair_slots)))
 
         parameters = self.parameters = t.Parameters()
@@ -431,6 +445,7 @@ def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNames
     stages = SimpleNamespace(
         kinematics=body.kinematics,
         free_motion=body.free_motion,
+        combine_pairs=rows.combine_pairs,
         select_contacts=rows.select_contacts,
         contact_rows=rows.contact_rows,
         certify=certify.make(real),
