@@ -4,12 +4,18 @@
 ``bounce`` shifts the rows of the contacts that bounce in this step. With friction, or where several contacts act on a body,
 Newton's law can return more energy than came in (Kane's paradox), so ``judge`` looks at the work of the impulses,
 
-    W = sum p . (u+ + u_free) / 2,
+    W = sum p . (u+ + u-) / 2,
 
-the kinetic energy that they add to free motion, in velocities relative to the surfaces, so that what a belt or a kinematic
-body gives by moving is not counted. Where W > 0 it has the environment solved again with theta e for 0 <= theta <= 1: for
-theta = 0 first, then by interpolation for the largest theta that adds nothing. W is a quadratic in theta as long as no contact
-changes its state, so the third point gives the answer. Environments that are done show the methods no contacts meanwhile.
+the energy that they add to the motion, in velocities relative to the surfaces, so that what a belt or a kinematic body gives
+by moving is not counted. Nor is the speed s at which overlaps that do not bounce are pushed apart: u_n+ - s stands for u_n+
+there. Where W > 0 it has the environment solved again with theta e for 0 <= theta <= 1: for theta = 0 first, then by
+interpolation for the largest theta that adds nothing. W is a quadratic in theta as long as no contact changes its state, so
+the third point gives the answer. Environments that are done show the methods no contacts meanwhile; where all are done, which
+is the rule, none of this is launched.
+
+Both -e u_n- and W look at u- at the start of the step, not at u_free. With M (v_free - v) = h f and constant f, Euler's rule
+keeps E + h f . v / 2, whose change by impulses is W exactly; so is that of E by the midpoint rule. With u_free in W a box could
+gain h |p| |g| / 2 an impact.
 """
 
 import functools
@@ -27,7 +33,7 @@ EXTRA_SOLVES = 5
 # Each theta tried is at least this part of the bracket inside it.
 INSIDE = wp.constant(1.0e-3)
 
-# What the answer in hand was solved for.
+# What the answer in hand was solved for; an environment that is done stays as it is, certified or not.
 DONE = wp.constant(0)
 ALL = wp.constant(1)  # theta = 1
 NONE = wp.constant(2)  # theta = 0
@@ -37,9 +43,9 @@ APPLY = wp.constant(4)  # the theta to stay with
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """Bundle ``Bounces`` and kernels ``bounce`` (dim E, R) and ``judge`` (dim E)."""
+    """Bundle ``Bounces`` and kernels ``bounce`` (dim E, R), ``judge`` and ``settle`` (dim E)."""
     t = scalar_types(real)
-    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    vec2, vec3 = t.vec2, t.vec3
     Contacts, Parameters, Topology = t.Contacts, t.Parameters, t.Topology
 
     @wp.struct
@@ -48,6 +54,7 @@ def make(real) -> SimpleNamespace:
 
         coefficient: wp.array2d(dtype=real)  # [1|E, S] e of each shape
         kick: wp.array2d(dtype=real)  # [E, R] what theta = 1 adds to the shift of the normal row, not positive, m/s
+        before: wp.array2d(dtype=vec3)  # [E, R] u- in the contact frame, m/s
         count: wp.array(dtype=int)  # [E] contacts
         stage: wp.array(dtype=int)  # [E]
         theta: wp.array(dtype=real)  # [E] of the present rows
@@ -56,6 +63,7 @@ def make(real) -> SimpleNamespace:
         low: wp.array(dtype=vec2)  # [E] largest theta known to add no energy
         high: wp.array(dtype=vec2)  # [E] smallest known to add some
         status: wp.array(dtype=int)  # [E] status bits of the solve in hand
+        again: wp.array(dtype=int)  # [1] not zero where some environment has to be solved again
 
     @wp.kernel(module="unique", enable_backward=False)
     def bounce(
@@ -72,8 +80,8 @@ def make(real) -> SimpleNamespace:
 
         An open gap bounces where free motion would close it in this step, and bounces from where it is: the impact is early
         by a part of a step. With Euler's rule that is as it should be, -e u_n- keeps the energy that the rule itself keeps.
-        The midpoint rule moves by the mean of u_n- and u_n+ where that closes no gap, and by u_n+ otherwise (kernels/integrate.py);
-        h u_n+ is then all uphill, so that gravity must have its part of u_n+.
+        The midpoint rule moves by the mean of u- and u+ where that closes no gap, and by u+ otherwise (kernels/integrate.py);
+        then gravity has slowed nothing on the way h u+, so u_n+ is less by what gravity adds in a step.
         """
         start, i = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
@@ -85,7 +93,8 @@ def make(real) -> SimpleNamespace:
             free = contacts.free[env, i]
             shift = contacts.shift[env, i]
             frame = contacts.frame[env, i]
-            u_n = wp.dot(vec3(frame[0, 0], frame[0, 1], frame[0, 2]), contacts.velocity[env, i])
+            before = frame * contacts.velocity[env, i]
+            u_n = before[0]
             gain = free[0] - shift[0] - u_n  # of free motion in this step
             fall = h * wp.length(parameters.gravity[env % parameters.gravity.shape[0]])
             threshold = real(RESTING_STEPS) * wp.max(fall, -gain) + tolerance
@@ -100,6 +109,7 @@ def make(real) -> SimpleNamespace:
                 contacts.shift[env, i] = shift
                 contacts.free[env, i] = free
             bounces.kick[env, i] = kick
+            bounces.before[env, i] = before
 
     @wp.func
     def root(low: vec2, high: vec2, third: vec2) -> real:
@@ -119,17 +129,31 @@ def make(real) -> SimpleNamespace:
     def work(
         shift: wp.array2d(dtype=vec3),
         free: wp.array2d(dtype=vec3),
+        gap: wp.array2d(dtype=real),
         impulse: wp.array2d(dtype=vec3),
-        velocity: wp.array2d(dtype=vec3),
+        kick: wp.array2d(dtype=real),
+        before: wp.array2d(dtype=vec3),
+        after: wp.array2d(dtype=vec3),
         env: int,
         count: int,
+        h: real,
+        midpoint: int,
     ):
-        """W [J], and sum |p| [N s]."""
+        """W [J], and sum |p| [N s].
+
+        Where the midpoint rule moves by u+ alone, E rises by another p . (u- - u_free) / 2: gravity slows nothing on that way.
+        """
         total = real(0.0)
         size = real(0.0)
         for i in range(count):
             p = impulse[env, i]
-            total += real(0.5) * wp.dot(p, velocity[env, i] + free[env, i] - shift[env, i])
+            u = before[env, i]
+            mean = real(0.5) * (u + after[env, i])
+            if midpoint != 0 and gap[env, i] + h * mean[0] < real(0.0):
+                mean += real(0.5) * (u - (free[env, i] - shift[env, i]))
+            if kick[env, i] == real(0.0):
+                mean[0] += real(0.5) * wp.min(shift[env, i][0], real(0.0))
+            total += wp.dot(p, mean)
             size += wp.length(p)
         return total, size
 
@@ -154,18 +178,19 @@ def make(real) -> SimpleNamespace:
     @wp.kernel(module="unique", enable_backward=False)
     def judge(
         attempt: int,
+        h: real,
         tolerance: real,
+        midpoint: int,
         contacts: Contacts,
         bounces: Bounces,
         unsolved: wp.array(dtype=int),
         reason: wp.array(dtype=int),
-        status: wp.array(dtype=int),
         stride: int,
     ):
         """After the certificate of solve number `attempt`: done with this environment, or the rows to solve next.
 
-        W may exceed what the impulses do without restitution (nothing, but for overlaps that are pushed apart and for
-        bristles that give back) by what an error of `tolerance` [m/s] in the velocities is worth.
+        W may exceed what the impulses do without restitution (nothing, but for bristles that give back) by what an error of
+        `tolerance` [m/s] in the velocities is worth.
         """
         start, _ = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
@@ -187,7 +212,19 @@ def make(real) -> SimpleNamespace:
             if stage == APPLY:
                 stage = DONE
             elif stage != DONE:
-                w, size = work(contacts.shift, contacts.free, contacts.impulse, contacts.velocity, env, count)
+                w, size = work(
+                    contacts.shift,
+                    contacts.free,
+                    contacts.gap,
+                    contacts.impulse,
+                    bounces.kick,
+                    bounces.before,
+                    contacts.velocity,
+                    env,
+                    count,
+                    h,
+                    midpoint,
+                )
                 low = bounces.low[env]
                 high = bounces.high[env]
                 third = vec2(real(-1.0), real(0.0))
@@ -234,22 +271,31 @@ def make(real) -> SimpleNamespace:
                 bounces.high[env] = high
 
             bounces.stage[env] = stage
-            contacts.count[env] = 0  # hides the environment from methods that look at no flag
-            if stage != DONE:
+            if stage == DONE:
+                unsolved[env] = 0
+                contacts.count[env] = 0  # hides the environment from methods that look at no flag
+            else:
+                bounces.again[0] = 1
                 contacts.count[env] = count
                 bounces.theta[env] = after
                 bounces.status[env] = 0
                 unsolved[env] = 1
                 reason[env] = 0
                 set_theta(contacts.shift, contacts.free, contacts.state, bounces.kick, env, count, after - theta)
-            if attempt == EXTRA_SOLVES:
-                contacts.count[env] = count
-                status[env] = status[env] | bounces.status[env]
-                if theta < real(1.0):
-                    status[env] = status[env] | RESTITUTION_REDUCED
-                # What follows looks at the gap that is left, not at the speed of the rebound.
-                for i in range(count):
-                    push = vec3(theta * bounces.kick[env, i], real(0.0), real(0.0))
-                    contacts.shift[env, i] = contacts.shift[env, i] - push
 
-    return SimpleNamespace(Bounces=Bounces, bounce=bounce, judge=judge)
+    @wp.kernel(module="unique", enable_backward=False)
+    def settle(contacts: Contacts, bounces: Bounces, status: wp.array(dtype=int), stride: int):
+        """When all environments are done: contacts and status as the other stages know them."""
+        start, _ = wp.tid()
+        for env in range(start, contacts.count.shape[0], stride):
+            contacts.count[env] = bounces.count[env]
+            theta = bounces.theta[env]
+            status[env] = status[env] | bounces.status[env]
+            if theta < real(1.0):
+                status[env] = status[env] | RESTITUTION_REDUCED
+            # What follows looks at the gap that is left, not at the speed of the rebound.
+            for i in range(bounces.count[env]):
+                push = vec3(theta * bounces.kick[env, i], real(0.0), real(0.0))
+                contacts.shift[env, i] = contacts.shift[env, i] - push
+
+    return SimpleNamespace(Bounces=Bounces, bounce=bounce, judge=judge, settle=settle)

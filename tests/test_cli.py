@@ -129,9 +129,10 @@ def test_bytes_per_env_are_those_of_a_simulator():
                 total += size(value)
         return total
 
-    model = wl.load_usd("box_on_ground")
-    one, three = (size(wl.Simulator(model, n, device="cpu")) for n in (1, 3))
-    assert bytes_per_env(model) == pytest.approx((three - one) / 2)
+    for scene in ("box_on_ground", "bouncing_balls"):
+        model = wl.load_usd(scene)
+        one, three = (size(wl.Simulator(model, n, device="cpu")) for n in (1, 3))
+        assert bytes_per_env(model) == pytest.approx((three - one) / 2)
 
 
 # ------------------------------------------------------------------------------------------------------------------ run

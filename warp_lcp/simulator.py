@@ -264,16 +264,20 @@ class Simulator:
             self._set_constant(self.bounces, "coefficient", value)
         elif value.any():
             k = restitution.make(self.real)
-            self._kernels.bounce, self._kernels.judge = k.bounce, k.judge
+            self._kernels.bounce, self._kernels.judge, self._kernels.settle = k.bounce, k.judge, k.settle
             bounces = self.bounces = k.Bounces()
             bounces.coefficient = self._constant(value, self.real)
-            bounces.kick = self._array(self.model.max_contacts, self.real)
-            for names, dtype in ((("theta", "slack", "allowed"), self.real), (("low", "high"), self._types.vec2),
-                                 (("count", "stage", "status"), int)):
+            bounces.kick, bounces.before = (
+                self._array(self.model.max_contacts, self.real),
+                self._array(self.model.max_contacts, self._types.vec3),
+            )
+            layout = {self.real: ("theta", "slack", "allowed"), self._types.vec2: ("low", "high"), int: ("count", "stage", "status")}
+            for dtype, names in layout.items():
                 for name in names:
                     setattr(bounces, name, wp.zeros(self.num_envs, dtype=dtype, device=self.device))
+            bounces.again = wp.zeros(1, dtype=int, device=self.device)
             if k.bounce not in self.kernels:
-                self._load([k.bounce, k.judge])
+                self._load([k.bounce, k.judge, k.settle])
             self._graphs.clear()
 
     def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
@@ -350,15 +354,12 @@ class Simulator:
         rows = [*scene, self.bodies, self.slots, h, *self._law, self.rows]
         self.launch(k.contact_rows, rows, self.model.max_contacts)
         if self.bounces is not None:
-            midpoint = int(self.integrator == "midpoint")
-            self.launch(k.bounce, [*scene, h, self.tolerance, midpoint, self.rows, self.bounces], self.model.max_contacts)
+            self.launch(
+                k.bounce, [*scene, h, self.tolerance, int(self.integrator == "midpoint"), self.rows, self.bounces], self.model.max_contacts
+            )
         self._solve_kernels(self.status)
         if self.bounces is not None:
-            answer = [self.tolerance, self.rows, self.bounces, self.unsolved, self.reason, self.status]
-            self.launch(k.judge, [0, *answer])
-            for attempt in range(1, restitution.EXTRA_SOLVES + 1):
-                self._solve_kernels(self.bounces.status)
-                self.launch(k.judge, [attempt, *answer])
+            self._judge_kernels()
         if self.integrator == "midpoint":
             self.launch(k.guard, [self.parameters, self.bodies, self.rows, self.next_velocity, h, self.tolerance, self.rounding])
             self.launch(k.integrate_midpoint, [*scene, self.bodies, self.next_velocity, self.wrench, h, self.q, self.v], b)
@@ -374,6 +375,25 @@ class Simulator:
             answer = [self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, status]
             problem = [self.bodies, self.dt, self.tolerance, i, final, self.next_velocity, self.rows, self.slots]
             self.launch(self._kernels.certify, [*problem, *answer])
+
+    def _judge_kernels(self) -> None:
+        """Where a rebound would raise the energy, the environment again with less restitution (kernels/restitution.py)."""
+        k, bounces = self._kernels, self.bounces
+        step = [self.dt, self.tolerance, int(self.integrator == "midpoint")]
+        answer = [*step, self.rows, bounces, self.unsolved, self.reason]
+
+        def solve_again() -> None:
+            for attempt in range(1, restitution.EXTRA_SOLVES + 1):
+                self._solve_kernels(bounces.status)
+                self.launch(k.judge, [attempt, *answer])
+
+        bounces.again.zero_()
+        self.launch(k.judge, [0, *answer])
+        if self.device.is_cpu or wp.is_conditional_graph_supported():
+            wp.capture_if(bounces.again, solve_again)
+        else:
+            solve_again()  # every environment that is done is skipped, launch by launch
+        self.launch(k.settle, [self.rows, bounces, self.status])
 
     def launch(self, kernel: wp.Kernel, inputs: list[Any], width: int = 1) -> None:
         """Launch a kernel whose threads stride over the environments, ``width`` of them side by side in each.
@@ -491,7 +511,8 @@ def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNames
         reset=reset.make(real),
     )
     if model.restitution.any():
-        stages.bounce, stages.judge = restitution.make(real).bounce, restitution.make(real).judge
+        rebound = restitution.make(real)
+        stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
     if integrator == "midpoint":
         stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
     else:
