@@ -200,7 +200,7 @@ def test_what_is_not_certified_is_said_and_the_exit_status_stays_zero(capsys, mo
     options = ("sphere_slip_roll", "--envs", 2, "--duration", 0.01)
     facts = summary(capsys, *options)
     assert facts["envs_not_ok"] == 1
-    assert facts["status"] == {"ITERATION_LIMIT": 1, "RAY": 0, "NOT_A_NUMBER": 0, "OVERFLOW": 0, "UNCERTIFIED": 1}
+    assert facts["status"] == {"ITERATION_LIMIT": 1, "RAY": 0, "NOT_A_NUMBER": 0, "OVERFLOW": 0, "UNCERTIFIED": 1, "RESTITUTION_REDUCED": 0}
     assert run(*options) == 0
     text = capsys.readouterr().out
     assert "1 of 2 environments were not OK" in text
