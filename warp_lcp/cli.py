@@ -175,16 +175,19 @@ def bytes_per_env(model: Model, formulation: str = "phantom_inertia") -> int:
     """Bytes that one more environment takes, float64: state, contacts and their history, without the method's workspace."""
     import warp as wp
 
+    from .kernels import restitution
     from .kernels.types import scalar_types
 
     types = scalar_types(wp.float64)
     widths = {types.Bodies: model.num_bodies, types.Slots: model.num_slots, types.Contacts: model.max_contacts}
+    if model.restitution.any():
+        widths[restitution.make(wp.float64).Bounces] = model.max_contacts
     total = 2 * 8 * (model.nq + model.nv)  # q, q0, v, v0
     total += 2 * model.num_bodies * wp.types.type_size_in_bytes(types.spatial)  # wrench, next velocity
     total += 4 * 4 + 3 * 8  # status, iterations, unsolved, reason; residuals, that of the best answer among them
     for bundle, width in widths.items():
         for name, variable in bundle.vars.items():
-            if name == "slip" and formulation != "coulomb":
+            if (name == "slip" and formulation != "coulomb") or name in ("coefficient", "again"):  # the latter for all alike
                 continue
             total += wp.types.type_size_in_bytes(variable.type.dtype) * (1 if variable.type.ndim == 1 else width)
     return total
@@ -409,7 +412,7 @@ class Tally:
             self.contacts.append(float(self.sim.contacts.count.numpy().mean()))
 
     def summary(self) -> dict[str, Any]:
-        from .simulator import Status
+        from .simulator import INFORMATIVE, Status
 
         residual = np.concatenate(self.residuals) if self.residuals else np.full(1, np.nan)
         env_steps = self.steps * self.sim.num_envs
@@ -422,7 +425,7 @@ class Tally:
             "residual_worst": _finite(self.worst),
             "residual_p99": _finite(np.percentile(residual, 99)),
             "residual_samples": len(self.residuals) * self.sim.num_envs,
-            "envs_not_ok": int(np.count_nonzero(self.seen)),
+            "envs_not_ok": int(np.count_nonzero(self.seen & ~INFORMATIVE)),
             "status": bits,
             "contacts_mean": float(np.mean(self.contacts)) if self.contacts else None,
             "iterations_mean": self.iterations / env_steps if env_steps else None,
