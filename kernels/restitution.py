@@ -55,7 +55,6 @@ def make(real) -> SimpleNamespace:
         coefficient: wp.array2d(dtype=real)  # [1|E, S] e of each shape
         kick: wp.array2d(dtype=real)  # [E, R] what theta = 1 adds to the shift of the normal row, not positive, m/s
         before: wp.array2d(dtype=vec3)  # [E, R] u- in the contact frame, m/s
-        count: wp.array(dtype=int)  # [E] contacts
         stage: wp.array(dtype=int)  # [E]
         theta: wp.array(dtype=real)  # [E] of the present rows
         slack: wp.array(dtype=real)  # [E] J, half of what W may exceed by
@@ -63,7 +62,8 @@ def make(real) -> SimpleNamespace:
         low: wp.array(dtype=vec2)  # [E] largest theta known to add no energy
         high: wp.array(dtype=vec2)  # [E] smallest known to add some
         status: wp.array(dtype=int)  # [E] status bits of the solve in hand
-        again: wp.array(dtype=int)  # [1] not zero where some environment has to be solved again
+        todo: wp.array(dtype=int)  # [E] environments that have to be solved again...
+        again: wp.array(dtype=int)  # [1] ... and their number
 
     @wp.kernel(module="unique", enable_backward=False)
     def bounce(
@@ -202,12 +202,11 @@ def make(real) -> SimpleNamespace:
                     if bounces.kick[env, i] < real(0.0) and solved:
                         stage = ALL
                 bounces.stage[env] = stage
-                bounces.count[env] = contacts.count[env]
                 bounces.theta[env] = real(1.0)
                 bounces.status[env] = 0
             stage = bounces.stage[env]
             theta = bounces.theta[env]
-            count = bounces.count[env]
+            count = contacts.count[env]
             after = theta
             if stage == APPLY:
                 stage = DONE
@@ -271,15 +270,10 @@ def make(real) -> SimpleNamespace:
                 bounces.high[env] = high
 
             bounces.stage[env] = stage
-            if stage == DONE:
-                unsolved[env] = 0
-                contacts.count[env] = 0  # hides the environment from methods that look at no flag
-            else:
-                bounces.again[0] = 1
-                contacts.count[env] = count
+            if stage != DONE:
+                bounces.todo[wp.atomic_add(bounces.again, 0, 1)] = env
                 bounces.theta[env] = after
                 bounces.status[env] = 0
-                unsolved[env] = 1
                 reason[env] = 0
                 set_theta(contacts.shift, contacts.free, contacts.state, bounces.kick, env, count, after - theta)
 
@@ -288,13 +282,12 @@ def make(real) -> SimpleNamespace:
         """When all environments are done: contacts and status as the other stages know them."""
         start, _ = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
-            contacts.count[env] = bounces.count[env]
             theta = bounces.theta[env]
             status[env] = status[env] | bounces.status[env]
             if theta < real(1.0):
                 status[env] = status[env] | RESTITUTION_REDUCED
             # What follows looks at the gap that is left, not at the speed of the rebound.
-            for i in range(bounces.count[env]):
+            for i in range(contacts.count[env]):
                 push = vec3(theta * bounces.kick[env, i], real(0.0), real(0.0))
                 contacts.shift[env, i] = contacts.shift[env, i] - push
 

@@ -184,7 +184,7 @@ def bytes_per_env(model: Model, formulation: str = "phantom_inertia") -> int:
         widths[restitution.make(wp.float64).Bounces] = model.max_contacts
     total = 2 * 8 * (model.nq + model.nv)  # q, q0, v, v0
     total += 2 * model.num_bodies * wp.types.type_size_in_bytes(types.spatial)  # wrench, next velocity
-    total += 4 * 4 + 3 * 8  # status, iterations, unsolved, reason; residuals, that of the best answer among them
+    total += 7 * 4 + 3 * 8  # status, iterations, unsolved, reason, lists of environments for three methods; residuals
     for bundle, width in widths.items():
         for name, variable in bundle.vars.items():
             if (name == "slip" and formulation != "coulomb") or name in ("coefficient", "again"):  # the latter for all alike

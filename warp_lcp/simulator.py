@@ -283,7 +283,7 @@ class Simulator:
                 self._array(self.model.max_contacts, self.real),
                 self._array(self.model.max_contacts, self._types.vec3),
             )
-            layout = {self.real: ("theta", "slack", "allowed"), self._types.vec2: ("low", "high"), int: ("count", "stage", "status")}
+            layout = {self.real: ("theta", "slack", "allowed"), self._types.vec2: ("low", "high"), int: ("stage", "status", "todo")}
             for dtype, names in layout.items():
                 for name in names:
                     setattr(bounces, name, wp.zeros(self.num_envs, dtype=dtype, device=self.device))
@@ -360,7 +360,6 @@ class Simulator:
         self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
         for kernel, first, number in self._pair_kernels:
             self.launch(kernel, [self.topology, self.bodies, first, h, self.slots], number)
-        self.unsolved.fill_(1)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
         rows = [*scene, self.bodies, self.slots, h, *self.law.row_arguments, self.rows]
@@ -369,7 +368,7 @@ class Simulator:
             self.launch(
                 k.bounce, [*scene, h, self.tolerance, int(self.integrator == "midpoint"), self.rows, self.bounces], self.model.max_contacts
             )
-        self._solve_kernels(self.status)
+        self._solve_kernels(self.everyone, self.num_everyone, self.status)
         if self.bounces is not None:
             self._judge_kernels()
         if self.integrator == "midpoint":
@@ -379,14 +378,28 @@ class Simulator:
             self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
         self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
 
-    def _solve_kernels(self, status: wp.array) -> None:
-        """Every method on what those before it left unsolved, each answer certified."""
-        for i, method in enumerate(self._methods):
-            method.launch(self)
-            final = int(i + 1 == len(self._methods))
-            answer = [self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, status]
-            problem = [self.bodies, self.dt, self.tolerance, i, final, self.next_velocity, self.rows, self.slots]
-            self.launch(self._kernels.certify, [*problem, *answer])
+    def _solve_kernels(self, todo: wp.array, number: wp.array, status: wp.array) -> None:
+        """The environments todo[:number] by the first method, those left by the next, and so on; each answer certified."""
+        self.queued.zero_()
+        self._solve_with(0, todo, number, status)
+
+    def _solve_with(self, i: int, todo: wp.array, number: wp.array, status: wp.array) -> None:
+        last = i + 1 == len(self._methods)
+        left, number_left = (todo, number) if last else (self.queues[i], self.queued[i : i + 1])
+        self._methods[i].launch(self, todo, number)
+        lists = [todo, number, left, number_left]
+        answer = [*lists, self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, status]
+        problem = [self.bodies, self.dt, self.tolerance, i, int(last), self.next_velocity, self.rows, self.slots]
+        self.launch(self._kernels.certify, [*problem, *answer])
+        if not last:
+            self._where(number_left, lambda: self._solve_with(i + 1, left, number_left, status))
+
+    def _where(self, number: wp.array, launches: Callable[[], None]) -> None:
+        """Launches that are skipped on the device while number is zero; where a device cannot, each finds nothing to do."""
+        if self.device.is_cpu or wp.is_conditional_graph_supported():
+            wp.capture_if(number, launches)
+        else:
+            launches()
 
     def _judge_kernels(self) -> None:
         """Where a rebound would raise the energy, the environment again with less restitution (kernels/restitution.py)."""
@@ -396,15 +409,13 @@ class Simulator:
 
         def solve_again() -> None:
             for attempt in range(1, restitution.EXTRA_SOLVES + 1):
-                self._solve_kernels(bounces.status)
+                self._solve_kernels(bounces.todo, bounces.again, bounces.status)
+                bounces.again.zero_()
                 self.launch(k.judge, [attempt, *answer])
 
         bounces.again.zero_()
         self.launch(k.judge, [0, *answer])
-        if self.device.is_cpu or wp.is_conditional_graph_supported():
-            wp.capture_if(bounces.again, solve_again)
-        else:
-            solve_again()  # every environment that is done is skipped, launch by launch
+        self._where(bounces.again, solve_again)
         self.launch(k.settle, [self.rows, bounces, self.status])
 
     def launch(self, kernel: wp.Kernel, inputs: list[Any], width: int = 1) -> None:
@@ -491,6 +502,8 @@ class Simulator:
         for array, values in ((self.q, m.q0), (self.q0, m.q0), (self.v, m.v0), (self.v0, m.v0)):
             array.assign(np.tile(values.astype(self._numpy_real), (e, 1)))
         self.wrench = self._array(b, t.spatial)
+        self.everyone: wp.array = wp.array(np.arange(e, dtype=np.int32), dtype=int, device=self.device)
+        self.num_everyone: wp.array = wp.array([e], dtype=int, device=self.device)
         self.status, self.iterations, self.unsolved, self.reason = (wp.zeros(e, dtype=int, device=self.device) for _ in range(4))
         self.residual, self.residual_energy, self.best_residual = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(3))
 
@@ -499,6 +512,10 @@ class Simulator:
         self._methods = [method(self.model, self.real, self.law) for method in chosen(self.method, self.precision, self.law)]
         for method in self._methods:
             method.prepare(self)
+        # Environments that each method but the last leaves to the next.
+        left = len(self._methods) - 1
+        self.queues: wp.array = wp.empty((left, self.num_envs), dtype=int, device=self.device)
+        self.queued: wp.array = wp.zeros(left, dtype=int, device=self.device)
         pair_kernels = [kernel for kernel, *_ in self._pair_kernels]
         self.kernels: list[Any] = []
         self._load([*vars(self._kernels).values(), *pair_kernels, *(m.kernel for m in self._methods)])
