@@ -12,12 +12,14 @@ from warp_lcp.builder import rotation_matrix
 SIZE_A, SIZE_B = np.array([0.3, 0.2, 0.1]), np.array([0.15, 0.25, 0.2])
 
 
-def slots(builder: wl.ModelBuilder, q: np.ndarray):
-    """Collision results of every environment: point, normal, gap, feature [E, C]."""
-    sim = simulator(builder, num_envs=len(q))
+def slots(builder: wl.ModelBuilder, q: np.ndarray, v: np.ndarray | None = None, dt: float = 1e-3, names: str = "point normal gap feature"):
+    """Collision results [E, C] of every environment at poses q [E, B, 7] and velocities v [E, B, 6]."""
+    sim = simulator(builder, num_envs=len(q), dt=dt)
     sim.q.assign(q.reshape(len(q), -1))
+    if v is not None:
+        sim.v.assign(v.reshape(len(q), -1))
     sim.step()
-    return (getattr(sim.slots, name).numpy() for name in ("point", "normal", "gap", "feature"))
+    return (getattr(sim.slots, name).numpy() for name in names.split())
 
 
 def box_distance(pose_a, size_a, pose_b, size_b) -> float:
@@ -177,6 +179,39 @@ def test_spheres_and_planes():
         assert normal[e, 1:9][real] == pytest.approx(np.broadcast_to(up, (real.sum(), 3)), abs=1e-12)
         counts[int(real.sum())] += 1
     assert np.count_nonzero(counts) > 3  # from none to all corners within reach
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box"])
+def test_open_gaps_of_spheres_count_what_the_motion_ahead_leaves(kind):
+    """gap + h n . u + bend is the gap a step ahead where the sphere passes by, and nothing is added where it passes through.
+
+    Where its centre would cross the box, or end behind the other centre, the tangent plane alone counts. To round-off, 1e-12.
+    """
+
+    def outside(x: np.ndarray) -> np.ndarray:
+        """From the box or the centre of the other sphere to points x [..., E, 3] of its frame."""
+        return x - np.clip(x, -SIZE_A, SIZE_A) if kind == "box" else x
+
+    rng = np.random.default_rng(8)
+    h, envs = 1e-2, 2000
+    q = random_poses(rng, envs, 0.6)
+    v = np.zeros((envs, 2, 6))
+    v[:, :, :3] = 20 * rng.normal(size=(envs, 2, 3))
+    other = (box(SIZE_A), 0.0) if kind == "box" else (sphere(0.15), 0.15)
+    normal, gap, bend = slots(two(sphere(0.1), other[0]), q, v, h, "normal gap bend")
+    normal, gap, bend = normal[:, 0], gap[:, 0], bend[:, 0]
+    turn = np.array([rotation_matrix(pose[3:]) for pose in q[:, 1]])
+    u = v[:, 0, :3] - v[:, 1, :3]
+    path = np.einsum("eji,kej->kei", turn, q[:, 0, :3] - q[:, 1, :3] + np.linspace(0, h, 401)[:, None, None] * u)
+    out = outside(path)
+    after = np.linalg.norm(out[-1], axis=-1) - 0.1 - other[1]
+    plane = gap - h * np.einsum("ej,ej->e", normal, u)
+    through = (gap > 0) & ((np.linalg.norm(out, axis=-1).min(0) == 0.0) | ((out[0] * out[-1]).sum(-1) <= 0))
+    assert through.sum() > 50
+    assert (bend[through] == 0.0).all()
+    beside = (gap > 0) & ~through & (after > plane)
+    assert (after[beside] > 0).sum() > 50
+    assert plane[beside] + bend[beside] == pytest.approx(after[beside], abs=1e-12)
 
 
 def test_concentric_spheres_part():

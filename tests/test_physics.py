@@ -274,10 +274,13 @@ def test_a_box_slides_over_seams_as_over_a_plane(h, turn):
     assert sim.v.numpy()[0, 0] == pytest.approx(4 - 0.1 * G * 0.4, rel=1e-6)
 
 
-@pytest.mark.parametrize(("h", "loss", "hop"), [(1e-3, 1e-3, 1e-7), (5e-3, 2e-2, 1e-5), (1e-2, 8e-2, 1e-4)])
-def test_a_sphere_rolls_over_seams(h, loss, hop):
-    """Ten seams at 2.1 m/s. Exact: no loss. The edge of the next tile is felt a step ahead with gravity's share of the step,
-    a loss that falls with h^2; without the curvature of the gap it was 0.3, 6 and 21 %, with hops of 3 mm."""
+@pytest.mark.parametrize(("h", "loss"), [(1e-3, 3.5e-4), (5e-3, 1e-4), (1e-2, 1e-4)])
+def test_a_sphere_rolls_over_seams(h, loss):
+    """Ten seams at 2.1 m/s. Exact: no loss, no hop; a hop of 1 nm is the static deflection g / 1e10.
+
+    Found: losses of 2.9e-4, 1.2e-5 and 4e-6 at the three steps, no hop. Free instead of present velocities in the bend of the
+    gap charge the edge of the next tile with the fall of a step: 4.5 % at 10 ms. Without any bend: 21 %, and hops of 3 mm.
+    """
     builder, material = wl.ModelBuilder(), wl.Material(0.5, 0.5)
     tiles(builder, material)
     body = builder.add_body(pose=(-0.5, 0, 0.1, 0, 0, 0, 1), velocity=(2.1, 0, 0), angular_velocity=(0, 21, 0))
@@ -285,8 +288,28 @@ def test_a_sphere_rolls_over_seams(h, loss, hop):
     sim = simulator(builder, dt=h)
     for _ in range(round(1.0 / h)):
         sim.step()
-        assert sim.q.numpy()[0, 2] - 0.1 < hop
+        assert sim.q.numpy()[0, 2] - 0.1 < 1e-9
     assert 1 - sim.v.numpy()[0, 0] / 2.1 < loss
+
+
+@pytest.mark.parametrize("speed", [5.0, 20.0, 50.0, 200.0])
+@pytest.mark.parametrize("target", ["plane", "plate", "sphere", "capsule"])
+def test_a_fast_sphere_does_not_pass_through(target, speed):
+    """Up to 2 m a step onto 1 cm: it stops at the surface, and the damping of the normal law pushes it back by 6 um at most."""
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    add, top = {
+        "plane": (lambda: builder.add_plane(), 0.0),
+        "plate": (lambda: builder.add_box(-1, (1, 1, 0.005)), 0.005),
+        "sphere": (lambda: builder.add_sphere(-1, 0.05), 0.05),
+        "capsule": (lambda: builder.add_capsule(-1, 0.005, 1, pose=(0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5))), 0.005),
+    }[target]
+    add()
+    builder.add_sphere(builder.add_body(pose=(0, 0, 0.3, 0, 0, 0, 1), velocity=(0, 0, -speed)), 0.05)
+    sim = simulator(builder, dt=1e-2)
+    for _ in range(20):
+        sim.step()
+        assert sim.status.numpy()[0] == 0
+    assert sim.q.numpy()[0, 2] == pytest.approx(top + 0.05, abs=1e-5)
 
 
 def test_tumbling_boxes_lose_energy_and_come_to_rest():
