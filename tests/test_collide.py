@@ -133,6 +133,42 @@ def test_features_follow_the_corners_while_a_box_slides():
         assert set(sim.slots.last_feature.numpy()[0]) - {-1} == first
 
 
+def separation(q: np.ndarray, size_a, size_b, shifts: np.ndarray) -> np.ndarray:
+    """[K, E] largest separation [m] over the 15 axes of boxes at q [E, 2, 7], box b shifted by [K, E, 3]; negative: overlap."""
+    a, b = (np.array([rotation_matrix(pose[3:]) for pose in q[:, k]]) for k in (0, 1))
+    axes = np.concatenate([a, b, *(np.cross(a[:, :, i, None], b, axis=1) for i in range(3))], axis=2)  # [E, 3, 15], in columns
+    length = np.linalg.norm(axes, axis=1, keepdims=True)
+    axes = np.where(length > 1e-6, axes / np.maximum(length, 1e-6), a[:, :, :1])
+    extent = np.einsum("j,ejk->ek", size_a, np.abs(np.einsum("eij,eik->ejk", a, axes)))
+    extent += np.einsum("j,ejk->ek", size_b, np.abs(np.einsum("eij,eik->ejk", b, axes)))
+    return np.array([(np.abs(np.einsum("ei,eik->ek", q[:, 1, :3] - q[:, 0, :3] + shift, axes)) - extent).max(1) for shift in shifts])
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["aligned", "turned"])
+@pytest.mark.parametrize("sizes", [((0.3, 0.3, 5e-4), (0.2, 0.2, 5e-4)), ((0.3, 0.3, 5e-4), (0.05, 0.05, 0.05)), (SIZE_A, SIZE_B)])
+def test_boxes_that_meet_within_a_step_have_a_point_that_closes(sizes, turned):
+    """In straight motion at 20 m/s and 10 ms: past thin plates, into corners, edges and faces.
+
+    Seen: 97 to 100 % of those that meet; what is missed grazes an edge or a corner. With axes compared at the pose ahead alone
+    and faces clipped where they are now it was 48 to 76 %, and 96 % of aligned thin plates.
+    """
+    size_a, size_b = map(np.array, sizes)
+    rng = np.random.default_rng(9)
+    h, envs = 1e-2, 3000
+    q = random_poses(rng, envs, 0.4)
+    if not turned:
+        q[:, :, 3:] = 0, 0, 0, 1
+    v = np.zeros((envs, 2, 6))
+    v[:, 1, :3] = 20 * rng.normal(size=(envs, 3))
+    normal, gap = slots(two(box(size_a), box(size_b)), q, v, h, "normal gap")
+    between = separation(q, size_a, size_b, np.linspace(0, h, 101)[:, None, None] * v[:, 1, :3])
+    # A tenth of the thinner box, so that what grazes counts little.
+    meet = (between[0] > 1e-4) & (between.min(0) < -0.1 * min(size_a.min(), size_b.min()))
+    closes = ((gap < 1e29) & (gap + h * np.einsum("enj,ej->en", normal, v[:, 1, :3]) < 0)).any(1)
+    assert meet.sum() > 100
+    assert closes[meet].mean() > 0.95
+
+
 def test_sphere_box():
     """Outside: distance to the nearest point of the box (bounded least squares). Inside: out through the nearest face."""
     rng = np.random.default_rng(6)
