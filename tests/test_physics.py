@@ -329,8 +329,9 @@ def test_a_fast_sphere_does_not_pass_through(target, speed):
 def test_a_fast_thin_plate_does_not_pass_through(target):
     """A plate of 1 mm at 10 m/s and 10 ms: 100 times its thickness a step. At an edge 30 m/s sideways take it past that edge.
 
-    From heights that cover a step, at an edge half of it; it stays above, to the 1 um that damping of the normal law lets it in or out. Past the edge
-    it is above after the first step; a gap of some millimetres left it a speed to close that by, with which it goes on down.
+    From heights that cover a step, at an edge half of it; it stays above, to the 1 um that damping of the normal law lets it in
+    or out. Past the edge it is above after the first step; a gap of some millimetres left it a speed to close that by, with
+    which it goes on down.
     """
     edge, target = "edge" in target, target.removeprefix("edge of a ")
     sideways = 30.0 if edge else 0.0
