@@ -9,6 +9,9 @@ import warp as wp
 from .collide import NO_POINT, pair_functions
 from .types import scalar_types
 
+# Of the smallest half extent: boxes that overlap by no more along an axis count as touching, which is how soft ones rest.
+TOUCHING = wp.constant(0.1)
+
 
 @functools.cache
 def axes(real) -> SimpleNamespace:
@@ -46,7 +49,18 @@ def axes(real) -> SimpleNamespace:
             extent += wp.abs(n[k]) * ha[k] + wp.abs(wp.dot(n, column(rotation, k))) * hb[k]
         return wp.abs(wp.dot(d, n)) - extent
 
-    return SimpleNamespace(face_separation=face_separation, edge_axis=edge_axis, edge_separation=edge_separation, column=column)
+    @wp.func
+    def rank(now: real, ahead: real, touching: real, far: real) -> real:
+        """Separation ahead, by which axes are compared; axes that part the boxes now come before all that do not.
+
+        For what boxes meet is a side that is between them now: ahead, one that lands near an edge, or has passed through,
+        may overlap less along another axis, or be clear of it.
+        """
+        if now < -touching:
+            return ahead - far
+        return ahead
+
+    return SimpleNamespace(face_separation=face_separation, edge_axis=edge_axis, edge_separation=edge_separation, column=column, rank=rank)
 
 
 @functools.cache
@@ -114,12 +128,29 @@ def make(real):
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f, a, p = pair_functions(real), axes(real), polygon(real)
     shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
-    face_separation, edge_axis, edge_separation, column = a.face_separation, a.edge_axis, a.edge_separation, a.column
+    face_separation, edge_axis, edge_separation, column, rank = a.face_separation, a.edge_axis, a.edge_separation, a.column, a.rank
     Polygon, append, clip = p.Polygon, p.append, p.clip
 
     @wp.func
-    def face_contacts(slots: Slots, env: int, slot: int, ref: transform, hr: vec3, inc: transform, hi: vec3, axis: int, flip: bool) -> int:
-        """Clip the incident face of one box against face `axis` of the reference box; returns the number of points."""
+    def face_contacts(
+        slots: Slots,
+        env: int,
+        slot: int,
+        ref: transform,
+        hr: vec3,
+        inc: transform,
+        hi: vec3,
+        axis: int,
+        flip: bool,
+        motion: vec3,
+        share: real,
+    ) -> int:
+        """Clip the incident face of one box against face `axis` of the reference box; returns the number of points.
+
+        motion: of the incident box relative to the reference box over the step, world axes. Open faces are clipped where they
+        are when they meet, or boxes that come from the side would meet nothing. Until then a point of the one is beside its
+        point of the other; share: how near the contact point is to the incident box's, 0 to 1.
+        """
         rotation = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(ref))) * wp.quat_to_matrix(wp.transform_get_rotation(inc))
         d = wp.transform_point(wp.transform_inverse(ref), wp.transform_get_translation(inc))
         side = real(1.0)
@@ -127,6 +158,14 @@ def make(real):
         if d[axis] < real(0.0):
             side = real(-1.0)
             face += 1
+        along = vec3()
+        open = face_separation(d, rotation, hr, hi, axis)
+        move = wp.quat_rotate_inv(wp.transform_get_rotation(ref), motion)
+        closing = -side * move[axis]
+        if open > real(0.0) and closing > open:
+            along = move * (open / closing)
+            along[axis] = real(0.0)
+        d += along
         # Incident face: the one whose outward normal points most against the reference normal.
         j = int(0)
         for k in range(1, 3):
@@ -169,7 +208,7 @@ def make(real):
             local[axis] = side * (hr[axis] + real(0.5) * corners.z[k])
             before = corners.edge[(k + corners.count - 1) % corners.count]
             feature = ((face * 6 + incident) * 8 + before) * 8 + corners.edge[k]
-            write(slots, env, slot + k, wp.transform_point(ref, local), normal, corners.z[k], feature)
+            write(slots, env, slot + k, wp.transform_point(ref, local - share * along), normal, corners.z[k], feature)
         return corners.count
 
     @wp.struct
@@ -274,6 +313,14 @@ def make(real):
         write(slots, env, slot, wp.transform_point(face, p), sign * wp.transform_vector(face, outward), z, feature)
         return 1
 
+    @wp.func
+    def inverse_mass(topology: Topology, bodies: Bodies, env: int, shape: int) -> real:
+        body = topology.shape_body[shape]
+        result = real(0.0)
+        if body >= 0:
+            result = bodies.inv_mass[env, body]
+        return result
+
     @wp.kernel(module="unique", enable_backward=False)
     def box_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, index = wp.tid()
@@ -303,19 +350,24 @@ def make(real):
                     topology, bodies, bodies.velocity, env, sa, ca
                 )
                 ahead = d + h * wp.quat_rotate_inv(wp.transform_get_rotation(xa), u)
-                ahead_b = wp.transpose(rotation) * ahead
+                back = wp.transpose(rotation)
+                d_b = back * d
+                ahead_b = back * ahead
                 # Prefer faces over edges and a over b, so that equal separations do not flip from step to step.
-                bias = real(1.0e-3) * wp.min(wp.min(ha), wp.min(hb))
-                best = face_separation(ahead, rotation, ha, hb, 0)
+                smallest = wp.min(wp.min(ha), wp.min(hb))
+                bias = real(1.0e-3) * smallest
+                touching = real(TOUCHING) * smallest
+                far = real(2.0) * apart
+                best = real(-2.0) * far
                 axis = int(0)
-                for k in range(1, 3):
-                    s = face_separation(ahead, rotation, ha, hb, k)
+                for k in range(3):
+                    s = rank(face_separation(d, rotation, ha, hb, k), face_separation(ahead, rotation, ha, hb, k), touching, far)
                     if s > best:
                         best = s
                         axis = k
                 best_b = best + bias
                 for k in range(3):
-                    s = face_separation(ahead_b, wp.transpose(rotation), hb, ha, k)
+                    s = rank(face_separation(d_b, back, hb, ha, k), face_separation(ahead_b, back, hb, ha, k), touching, far)
                     if s > best_b:
                         best_b = s
                         best = s
@@ -324,14 +376,20 @@ def make(real):
                 for ij in range(9):
                     n = edge_axis(rotation, ij // 3, ij % 3)
                     if wp.dot(n, n) > real(0.0):
-                        s = edge_separation(ahead, rotation, ha, hb, n)
+                        s = rank(edge_separation(d, rotation, ha, hb, n), edge_separation(ahead, rotation, ha, hb, n), touching, far)
                         if s > best_edge:
                             best_edge = s
                             axis = 6 + ij
+                # Levers are those of the lighter box, which turns more easily.
+                inverse_a = inverse_mass(topology, bodies, env, sa)
+                inverse_b = inverse_mass(topology, bodies, env, sb)
+                share = real(0.5)
+                if inverse_a + inverse_b > real(0.0):
+                    share = inverse_b / (inverse_a + inverse_b)
                 if axis < 3:
-                    count = face_contacts(slots, env, slot, xa, ha, xb, hb, axis, False)
+                    count = face_contacts(slots, env, slot, xa, ha, xb, hb, axis, False, h * u, share)
                 elif axis < 6:
-                    count = face_contacts(slots, env, slot, xb, hb, xa, ha, axis - 3, True)
+                    count = face_contacts(slots, env, slot, xb, hb, xa, ha, axis - 3, True, -h * u, real(1.0) - share)
                 else:
                     i = (axis - 6) // 3
                     j = (axis - 6) % 3
@@ -340,7 +398,6 @@ def make(real):
                     write(slots, env, slot, wp.transform_point(xa, crossing.point), normal, crossing.gap, crossing.feature)
                     count = 1
                     # The edge of b over a face of a, and that of a over a face of b.
-                    back = wp.transpose(rotation)
                     n = crossing.normal
                     near = crossing.point
                     count += edge_over_face(

@@ -42,6 +42,7 @@ def segment_functions(real) -> SimpleNamespace:
     """Points of a segment c + t e, |t| <= half, e a unit vector, that are nearest to other shapes."""
     t = scalar_types(real)
     vec3 = t.vec3
+    outside_box = pair_functions(real).outside_box
 
     @wp.struct
     class Stretch:
@@ -83,11 +84,6 @@ def segment_functions(real) -> SimpleNamespace:
                 s.high = last
                 s.high_end = last_end
         return s
-
-    @wp.func
-    def outside_box(p: vec3, size: vec3) -> vec3:
-        """From the nearest point of a box to p, in the frame of the box; zero inside."""
-        return p - vec3(wp.clamp(p[0], -size[0], size[0]), wp.clamp(p[1], -size[1], size[1]), wp.clamp(p[2], -size[2], size[2]))
 
     @wp.func
     def nearest_to_box(c: vec3, e: vec3, half: real, size: vec3) -> real:
@@ -154,29 +150,15 @@ def segment_functions(real) -> SimpleNamespace:
             n = out / distance
         return n
 
-    @wp.func
-    def bend(distance: real, n: vec3, closing: vec3, distance_ahead: real, n_ahead: vec3) -> real:
-        """How much more distance is left after a motion than distance + n . closing, the tangent plane's.
-
-        What is left between the shapes as a whole counts, wherever it is. Nothing where the segment would meet or pass the
-        other shape.
-        """
-        result = real(0.0)
-        if distance_ahead > real(0.0) and wp.dot(n, n_ahead) > real(0.0):
-            result = wp.max(distance_ahead - distance - wp.dot(n, closing), real(0.0))
-        return result
-
     return SimpleNamespace(
         Stretch=Stretch,
         whole=whole,
         cut=cut,
-        outside_box=outside_box,
         nearest_to_box=nearest_to_box,
         outside_segment=outside_segment,
         nearest_to_segment=nearest_to_segment,
         perpendicular=perpendicular,
         direction=direction,
-        bend=bend,
     )
 
 
@@ -188,24 +170,19 @@ def make(real) -> dict:
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f, g = pair_functions(real), segment_functions(real)
     shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
-    whole, cut, direction, perpendicular, bend = g.whole, g.cut, g.direction, g.perpendicular, g.bend
-    outside_box, nearest_to_box = g.outside_box, g.nearest_to_box
-    outside_segment, nearest_to_segment = g.outside_segment, g.nearest_to_segment
+    outside_box, bend, whole, cut, direction, perpendicular = f.outside_box, f.bend, g.whole, g.cut, g.direction, g.perpendicular
+    outside_segment, nearest_to_box, nearest_to_segment = g.outside_segment, g.nearest_to_box, g.nearest_to_segment
     covered_part = wp.constant(covered_within(real))
 
     @wp.struct
     class Motion:
-        """Motion of a capsule relative to the other shape over a step at present velocities, world axes, and where it leads.
-
-        Present velocities, not free ones: what supports a rolling capsule takes the fall that free motion adds, and an edge
-        ahead must not take it too (2.5 % of the speed over six seams at 10 ms, 0.4 % so).
-        """
+        """Motion of a capsule relative to the other shape over a step at present velocities, world axes, and where it leads."""
 
         middle: vec3  # of the segment, now
         shift: vec3  # h u of that point, m
         turn: vec3  # h w, rad
         distance: real  # of the segment from the other shape, then
-        normal: vec3  # towards the segment, then; of any length
+        normal: vec3  # to the segment, then; of that length
         near: real  # what is further away than this gets no row
 
     @wp.func

@@ -14,6 +14,8 @@ import warp as wp
 from .types import scalar_types
 
 NO_POINT = wp.constant(1.0e30)
+# Cosine: directions from faces of a box that are square to each other, rotated to world axes, agree by less than this.
+SQUARE = wp.constant(1.0e-6)
 
 
 @functools.cache
@@ -56,6 +58,27 @@ def pair_functions(real) -> SimpleNamespace:
         return u
 
     @wp.func
+    def outside_box(p: vec3, size: vec3) -> vec3:
+        """From the nearest point of a box to p, in the frame of the box; zero inside."""
+        return p - vec3(wp.clamp(p[0], -size[0], size[0]), wp.clamp(p[1], -size[1], size[1]), wp.clamp(p[2], -size[2], size[2]))
+
+    @wp.func
+    def bend(distance: real, n: vec3, closing: vec3, distance_ahead: real, n_ahead: vec3) -> real:
+        """How much more distance is left after a motion than distance + n . closing, the tangent plane's.
+
+        Of a point or segment from another shape; n and n_ahead point from the one to the other, n_ahead is of length distance_ahead.
+        What is left between the two as a whole counts, wherever it is. Nothing where they would meet, or pass through each
+        other: space behind an obstacle is not free.
+
+        The motion is that of present velocities, not of free ones: what supports a rolling sphere takes the fall that free
+        motion adds, and an edge ahead must not take it too.
+        """
+        result = real(0.0)
+        if distance_ahead > real(0.0) and wp.dot(n, n_ahead) > real(SQUARE) * distance_ahead:
+            result = wp.max(distance_ahead - distance - wp.dot(n, closing), real(0.0))
+        return result
+
+    @wp.func
     def write_bent(slots: Slots, env: int, slot: int, point: vec3, normal: vec3, gap: real, bend: real, feature: int):
         slots.point[env, slot] = point
         slots.normal[env, slot] = normal
@@ -68,7 +91,15 @@ def pair_functions(real) -> SimpleNamespace:
         """A point between flat features: its gap changes by h u_n."""
         write_bent(slots, env, slot, point, normal, gap, real(0.0), feature)
 
-    return SimpleNamespace(shape_pose=shape_pose, reach=reach, shape_velocity=shape_velocity, write=write, write_bent=write_bent)
+    return SimpleNamespace(
+        shape_pose=shape_pose,
+        reach=reach,
+        shape_velocity=shape_velocity,
+        outside_box=outside_box,
+        bend=bend,
+        write=write,
+        write_bent=write_bent,
+    )
 
 
 @functools.cache
@@ -82,6 +113,7 @@ def make(real) -> dict:
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f = pair_functions(real)
     shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
+    outside_box, bend = f.outside_box, f.bend
 
     @wp.kernel(module="unique", enable_backward=False)
     def plane_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
@@ -143,20 +175,11 @@ def make(real) -> dict:
             if distance > real(0.0):
                 normal = offset / distance
             gap = distance - ra - rb
-            u = shape_velocity(topology, bodies, bodies.free_velocity, env, topology.pairs[pair, 1], b)
-            u -= shape_velocity(topology, bodies, bodies.free_velocity, env, topology.pairs[pair, 0], a)
-            # The gap of curved surfaces that pass each other closes less than the tangent plane says.
-            bend = wp.length(offset + h * u) - distance - h * wp.dot(normal, u)
-            write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, bend, 0)
-
-    @wp.func
-    def box_distance(p: vec3, size: vec3) -> real:
-        """Distance of a point from a box in the box's frame; inside: minus the depth under the nearest face."""
-        outside = vec3(
-            wp.max(wp.abs(p[0]) - size[0], real(0.0)), wp.max(wp.abs(p[1]) - size[1], real(0.0)), wp.max(wp.abs(p[2]) - size[2], real(0.0))
-        )
-        depth = wp.max(wp.max(wp.abs(p[0]) - size[0], wp.abs(p[1]) - size[1]), wp.abs(p[2]) - size[2])
-        return wp.length(outside) + wp.min(depth, real(0.0))
+            u = shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 1], b)
+            u -= shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 0], a)
+            ahead = offset + h * u
+            left = bend(distance, normal, h * u, wp.length(ahead), ahead)
+            write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, left, 0)
 
     @wp.kernel(module="unique", enable_backward=False)
     def sphere_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
@@ -168,12 +191,8 @@ def make(real) -> dict:
             box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
             size = topology.shape_size[topology.pairs[pair, 1]]
             local = wp.transform_point(wp.transform_inverse(box), centre)
-            nearest = vec3(
-                wp.clamp(local[0], -size[0], size[0]),
-                wp.clamp(local[1], -size[1], size[1]),
-                wp.clamp(local[2], -size[2], size[2]),
-            )
-            inward = nearest - local
+            inward = -outside_box(local, size)
+            nearest = local + inward
             distance = wp.length(inward)
             if distance > real(0.0):
                 inward = inward / distance
@@ -196,14 +215,11 @@ def make(real) -> dict:
             normal = wp.transform_vector(box, inward)
             gap = distance - radius
             point = wp.transform_point(box, nearest) - normal * (real(0.5) * gap)
-            # A sphere that rolls towards an edge it will just touch closes less of the gap than the tangent plane says.
-            u = shape_velocity(topology, bodies, bodies.free_velocity, env, topology.pairs[pair, 0], centre)
-            u -= shape_velocity(topology, bodies, bodies.free_velocity, env, topology.pairs[pair, 1], centre)
-            bend = real(0.0)
-            if gap > real(0.0):
-                ahead = local + h * wp.quat_rotate_inv(wp.transform_get_rotation(box), u)
-                bend = wp.max(box_distance(ahead, size) - distance + h * wp.dot(normal, u), real(0.0))
-            write_bent(slots, env, topology.pair_slots[pair], point, normal, gap, bend, 0)
+            u = shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 0], centre)
+            u -= shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 1], centre)
+            ahead = wp.transform_vector(box, outside_box(local + h * wp.quat_rotate_inv(wp.transform_get_rotation(box), u), size))
+            left = bend(distance, -normal, h * u, wp.length(ahead), ahead)
+            write_bent(slots, env, topology.pair_slots[pair], point, normal, gap, left, 0)
 
     return {
         ("PLANE", "SPHERE"): plane_sphere,

@@ -18,9 +18,10 @@ from . import rigid
 from .collide import NO_POINT, pair_functions
 from .types import CONE, DISC, FACETS, FREE, OVERFLOW, REGULARIZED, scalar_types
 
-# Overlaps are pushed apart no faster than this [m/s], whatever the stiffness.
+# Overlaps that no load explains are pushed apart no faster than this [m/s], whatever the stiffness.
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
-# A contact that opens by more than this many static deflections under its weight has separated.
+# A contact that opens by more than this many static deflections under its weight has separated; one that is deeper than as
+# many under its weight or last impulse overlaps for another reason.
 ELASTIC_RANGE = wp.constant(10.0)
 # A predicted slip under this part of the free velocity is round-off and has no direction.
 NO_SLIP = wp.constant(1.0e-6)
@@ -136,7 +137,15 @@ def row_functions(real) -> SimpleNamespace:
         closed = phi <= real(0.0) or (history.touched and phi * k_n * h <= real(ELASTIC_RANGE) * weight)
         d_n = (phi + bend) / h
         if closed:
-            d_n = wp.max(eps_n * h * k_n * phi, -real(MAX_DEPENETRATION_SPEED))
+            # Overlap that no load explains is pushed apart with the speed that gravity takes away until the surfaces are
+            # clear, or it would stay in the bodies. Springs keep what they are owed.
+            load = real(ELASTIC_RANGE) * wp.max(weight, impulse)
+            push = real(MAX_DEPENETRATION_SPEED)
+            if g > real(0.0):
+                depth = wp.max(-phi - load / (k_n * h), real(0.0))
+                fall = real(0.5) * g * h
+                push = wp.min(push, wp.sqrt(real(2.0) * g * depth + fall * fall) - fall)
+            d_n = wp.max(eps_n * h * k_n * phi, -eps_n * load - push)
 
         eps_t = real(1.0) / (k_t * h * h + b_t * h)
         if directions < 0:  # Anitescu and Potra: rigid friction, no bristles

@@ -12,12 +12,14 @@ from warp_lcp.builder import rotation_matrix
 SIZE_A, SIZE_B = np.array([0.3, 0.2, 0.1]), np.array([0.15, 0.25, 0.2])
 
 
-def slots(builder: wl.ModelBuilder, q: np.ndarray):
-    """Collision results of every environment: point, normal, gap, feature [E, C]."""
-    sim = simulator(builder, num_envs=len(q))
+def slots(builder: wl.ModelBuilder, q: np.ndarray, v: np.ndarray | None = None, dt: float = 1e-3, names: str = "point normal gap feature"):
+    """Collision results [E, C] of every environment at poses q [E, B, 7] and velocities v [E, B, 6]."""
+    sim = simulator(builder, num_envs=len(q), dt=dt)
     sim.q.assign(q.reshape(len(q), -1))
+    if v is not None:
+        sim.v.assign(v.reshape(len(q), -1))
     sim.step()
-    return (getattr(sim.slots, name).numpy() for name in ("point", "normal", "gap", "feature"))
+    return (getattr(sim.slots, name).numpy() for name in names.split())
 
 
 def box_distance(pose_a, size_a, pose_b, size_b) -> float:
@@ -131,6 +133,42 @@ def test_features_follow_the_corners_while_a_box_slides():
         assert set(sim.slots.last_feature.numpy()[0]) - {-1} == first
 
 
+def separation(q: np.ndarray, size_a, size_b, shifts: np.ndarray) -> np.ndarray:
+    """[K, E] largest separation [m] over the 15 axes of boxes at q [E, 2, 7], box b shifted by [K, E, 3]; negative: overlap."""
+    a, b = (np.array([rotation_matrix(pose[3:]) for pose in q[:, k]]) for k in (0, 1))
+    axes = np.concatenate([a, b, *(np.cross(a[:, :, i, None], b, axis=1) for i in range(3))], axis=2)  # [E, 3, 15], in columns
+    length = np.linalg.norm(axes, axis=1, keepdims=True)
+    axes = np.where(length > 1e-6, axes / np.maximum(length, 1e-6), a[:, :, :1])
+    extent = np.einsum("j,ejk->ek", size_a, np.abs(np.einsum("eij,eik->ejk", a, axes)))
+    extent += np.einsum("j,ejk->ek", size_b, np.abs(np.einsum("eij,eik->ejk", b, axes)))
+    return np.array([(np.abs(np.einsum("ei,eik->ek", q[:, 1, :3] - q[:, 0, :3] + shift, axes)) - extent).max(1) for shift in shifts])
+
+
+@pytest.mark.parametrize("turned", [False, True], ids=["aligned", "turned"])
+@pytest.mark.parametrize("sizes", [((0.3, 0.3, 5e-4), (0.2, 0.2, 5e-4)), ((0.3, 0.3, 5e-4), (0.05, 0.05, 0.05)), (SIZE_A, SIZE_B)])
+def test_boxes_that_meet_within_a_step_have_a_point_that_closes(sizes, turned):
+    """In straight motion at 20 m/s and 10 ms: past thin plates, into corners, edges and faces.
+
+    Seen: 97 to 100 % of those that meet; what is missed grazes an edge or a corner. With axes compared at the pose ahead alone
+    and faces clipped where they are now it was 48 to 76 %, and 96 % of aligned thin plates.
+    """
+    size_a, size_b = map(np.array, sizes)
+    rng = np.random.default_rng(9)
+    h, envs = 1e-2, 3000
+    q = random_poses(rng, envs, 0.4)
+    if not turned:
+        q[:, :, 3:] = 0, 0, 0, 1
+    v = np.zeros((envs, 2, 6))
+    v[:, 1, :3] = 20 * rng.normal(size=(envs, 3))
+    normal, gap = slots(two(box(size_a), box(size_b)), q, v, h, "normal gap")
+    between = separation(q, size_a, size_b, np.linspace(0, h, 101)[:, None, None] * v[:, 1, :3])
+    # A tenth of the thinner box, so that what grazes counts little.
+    meet = (between[0] > 1e-4) & (between.min(0) < -0.1 * min(size_a.min(), size_b.min()))
+    closes = ((gap < 1e29) & (gap + h * np.einsum("enj,ej->en", normal, v[:, 1, :3]) < 0)).any(1)
+    assert meet.sum() > 100
+    assert closes[meet].mean() > 0.95
+
+
 def test_sphere_box():
     """Outside: distance to the nearest point of the box (bounded least squares). Inside: out through the nearest face."""
     rng = np.random.default_rng(6)
@@ -177,6 +215,39 @@ def test_spheres_and_planes():
         assert normal[e, 1:9][real] == pytest.approx(np.broadcast_to(up, (real.sum(), 3)), abs=1e-12)
         counts[int(real.sum())] += 1
     assert np.count_nonzero(counts) > 3  # from none to all corners within reach
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box"])
+def test_open_gaps_of_spheres_count_what_the_motion_ahead_leaves(kind):
+    """gap + h n . u + bend is the gap a step ahead where the sphere passes by, and nothing is added where it passes through.
+
+    Where its centre would cross the box, or end behind the other centre, the tangent plane alone counts. To round-off, 1e-12.
+    """
+
+    def outside(x: np.ndarray) -> np.ndarray:
+        """From the box or the centre of the other sphere to points x [..., E, 3] of its frame."""
+        return x - np.clip(x, -SIZE_A, SIZE_A) if kind == "box" else x
+
+    rng = np.random.default_rng(8)
+    h, envs = 1e-2, 2000
+    q = random_poses(rng, envs, 0.6)
+    v = np.zeros((envs, 2, 6))
+    v[:, :, :3] = 20 * rng.normal(size=(envs, 2, 3))
+    other = (box(SIZE_A), 0.0) if kind == "box" else (sphere(0.15), 0.15)
+    normal, gap, bend = slots(two(sphere(0.1), other[0]), q, v, h, "normal gap bend")
+    normal, gap, bend = normal[:, 0], gap[:, 0], bend[:, 0]
+    turn = np.array([rotation_matrix(pose[3:]) for pose in q[:, 1]])
+    u = v[:, 0, :3] - v[:, 1, :3]
+    path = np.einsum("eji,kej->kei", turn, q[:, 0, :3] - q[:, 1, :3] + np.linspace(0, h, 401)[:, None, None] * u)
+    out = outside(path)
+    after = np.linalg.norm(out[-1], axis=-1) - 0.1 - other[1]
+    plane = gap - h * np.einsum("ej,ej->e", normal, u)
+    through = (gap > 0) & ((np.linalg.norm(out, axis=-1).min(0) == 0.0) | ((out[0] * out[-1]).sum(-1) <= 0))
+    assert through.sum() > 50
+    assert (bend[through] == 0.0).all()
+    beside = (gap > 0) & ~through & (after > plane)
+    assert (after[beside] > 0).sum() > 50
+    assert plane[beside] + bend[beside] == pytest.approx(after[beside], abs=1e-12)
 
 
 def test_concentric_spheres_part():

@@ -274,10 +274,26 @@ def test_a_box_slides_over_seams_as_over_a_plane(h, turn):
     assert sim.v.numpy()[0, 0] == pytest.approx(4 - 0.1 * G * 0.4, rel=1e-6)
 
 
-@pytest.mark.parametrize(("h", "loss", "hop"), [(1e-3, 1e-3, 1e-7), (5e-3, 2e-2, 1e-5), (1e-2, 8e-2, 1e-4)])
-def test_a_sphere_rolls_over_seams(h, loss, hop):
-    """Ten seams at 2.1 m/s. Exact: no loss. The edge of the next tile is felt a step ahead with gravity's share of the step,
-    a loss that falls with h^2; without the curvature of the gap it was 0.3, 6 and 21 %, with hops of 3 mm."""
+@pytest.mark.parametrize("h", [5e-3, 1e-2])
+def test_a_soft_box_slides_over_seams(h):
+    """Sunk in by 1 mm, 2 % of its half height: the side of the next tile is no obstacle either. 1e-3: found 4e-4 and -1e-4."""
+    stiffness = G / (4 * 1e-3)
+    builder, material = wl.ModelBuilder(), wl.Material(0.1, 0.1, stiffness, 0.01 * stiffness)
+    tiles(builder, material)
+    body = builder.add_body(pose=(-0.5, 0, 0.049, 0, 0, 0, 1), velocity=(4, 0, 0))
+    builder.add_box(body, (0.05, 0.05, 0.05), material=material)
+    sim = simulator(builder, dt=h)
+    sim.step(round(0.4 / h))
+    assert sim.v.numpy()[0, 0] == pytest.approx(4 - 0.1 * G * 0.4, rel=1e-3)
+
+
+@pytest.mark.parametrize(("h", "loss"), [(1e-3, 3.5e-4), (5e-3, 1e-4), (1e-2, 1e-4)])
+def test_a_sphere_rolls_over_seams(h, loss):
+    """Ten seams at 2.1 m/s. Exact: no loss, no hop; a hop of 1 nm is the static deflection g / 1e10.
+
+    Found: losses of 2.9e-4, 1.2e-5 and 4e-6 at the three steps, no hop. Free instead of present velocities in the bend of the
+    gap charge the edge of the next tile with the fall of a step: 4.5 % at 10 ms. Without any bend: 21 %, and hops of 3 mm.
+    """
     builder, material = wl.ModelBuilder(), wl.Material(0.5, 0.5)
     tiles(builder, material)
     body = builder.add_body(pose=(-0.5, 0, 0.1, 0, 0, 0, 1), velocity=(2.1, 0, 0), angular_velocity=(0, 21, 0))
@@ -285,8 +301,102 @@ def test_a_sphere_rolls_over_seams(h, loss, hop):
     sim = simulator(builder, dt=h)
     for _ in range(round(1.0 / h)):
         sim.step()
-        assert sim.q.numpy()[0, 2] - 0.1 < hop
+        assert sim.q.numpy()[0, 2] - 0.1 < 1e-9
     assert 1 - sim.v.numpy()[0, 0] / 2.1 < loss
+
+
+@pytest.mark.parametrize("speed", [5.0, 20.0, 50.0, 200.0])
+@pytest.mark.parametrize("target", ["plane", "plate", "sphere", "capsule"])
+def test_a_fast_sphere_does_not_pass_through(target, speed):
+    """Up to 2 m a step onto 1 cm: it stops at the surface, and the damping of the normal law pushes it back by 6 um at most."""
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    add, top = {
+        "plane": (lambda: builder.add_plane(), 0.0),
+        "plate": (lambda: builder.add_box(-1, (1, 1, 0.005)), 0.005),
+        "sphere": (lambda: builder.add_sphere(-1, 0.05), 0.05),
+        "capsule": (lambda: builder.add_capsule(-1, 0.005, 1, pose=(0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5))), 0.005),
+    }[target]
+    add()
+    builder.add_sphere(builder.add_body(pose=(0, 0, 0.3, 0, 0, 0, 1), velocity=(0, 0, -speed)), 0.05)
+    sim = simulator(builder, dt=1e-2)
+    for _ in range(20):
+        sim.step()
+        assert sim.status.numpy()[0] == 0
+    assert sim.q.numpy()[0, 2] == pytest.approx(top + 0.05, abs=1e-5)
+
+
+@pytest.mark.parametrize("target", ["plane", "thin box", "box", "sphere", "capsule", "edge of a thin box", "edge of a box"])
+def test_a_fast_thin_plate_does_not_pass_through(target):
+    """A plate of 1 mm at 10 m/s and 10 ms: 100 times its thickness a step. At an edge 30 m/s sideways take it past that edge.
+
+    From heights that cover a step, at an edge half of it; it stays above, to the 1 um that damping of the normal law lets it in
+    or out. Past the edge it is above after the first step; a gap of some millimetres left it a speed to close that by, with
+    which it goes on down.
+    """
+    edge, target = "edge" in target, target.removeprefix("edge of a ")
+    sideways = 30.0 if edge else 0.0
+    add, top = {
+        "plane": (lambda b: b.add_plane(), 0.0),
+        "thin box": (lambda b: b.add_box(-1, (0.1, 0.1, 5e-4)), 5e-4),
+        "box": (lambda b: b.add_box(-1, (0.1, 0.1, 0.1)), 0.1),
+        "sphere": (lambda b: b.add_sphere(-1, 0.05), 0.05),
+        "capsule": (lambda b: b.add_capsule(-1, 0.05, 0.1, pose=(0, 0, 0, 0, np.sqrt(0.5), 0, np.sqrt(0.5))), 0.05),
+    }[target]
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    add(builder)
+    builder.add_box(builder.add_body(velocity=(sideways, 0, -10)), (0.05, 0.05, 5e-4))
+    envs = 21
+    sim = simulator(builder, num_envs=envs, dt=1e-2)
+    height = top + 5e-4 + np.linspace(0.001, 0.046 if edge else 0.101, envs)
+    q = np.tile(sim.q0.numpy()[:1], (envs, 1))
+    q[:, 0], q[:, 2] = -sideways / 10 * (height - top - 5e-4), height  # meets the middle of what is below
+    sim.q.assign(q)
+    for _ in range(1 if edge else 3):
+        sim.step()
+        assert (sim.status.numpy() == 0).all()
+        assert sim.q.numpy()[:, 2].min() - top - 5e-4 > -1e-6
+
+
+@pytest.mark.parametrize("h", [1e-3, 5e-3, 1e-2])
+@pytest.mark.parametrize("deep", [1e-3, 1e-2, 5e-2])
+def test_what_starts_overlapping_comes_out_and_stays(deep, h):
+    """Out of a box within 0.15 s, and then no higher than 0.2 mm: found 0.12 mm at most. Its push cost 3 m/s and 0.4 m once."""
+    builder = wl.ModelBuilder()
+    builder.add_box(-1, (1, 1, 0.2), pose=(0, 0, -0.2, 0, 0, 0, 1))
+    builder.add_box(builder.add_body(pose=(0, 0, 0.1 - deep, 0, 0, 0, 1)), (0.1, 0.1, 0.1))
+    sim = simulator(builder, dt=h)
+    height = []
+    for _ in range(round(0.5 / h)):
+        sim.step()
+        assert sim.status.numpy()[0] == 0
+        height.append(sim.q.numpy()[0, 2] - 0.1)
+    assert max(height) < 2e-4
+    assert min(height[round(0.15 / h) :]) > -1e-6
+    assert abs(sim.v.numpy()[0, 2]) < 1e-6
+
+
+def test_a_soft_spring_carries():
+    """1 kg on 1000 N/m from 0.5 m, damped by b + k h = 2 N s/m: the first dip and bounce of that oscillator, then rest.
+
+    The limit on the push of overlaps is not for what a load explains: with it the spring gave way, and the ball fell through.
+    Dip: -104.0 mm by the recursion below, to round-off; rest at -m g / k, from which 6 s at a rate of 1 / s are
+    e^-6 of 0.1 m away.
+    """
+    builder, soft, h = wl.ModelBuilder(), wl.Material(0.5, 0.5, 1e3, 1.0), 1e-3
+    builder.add_plane(material=soft)
+    builder.add_sphere(builder.add_body(pose=(0, 0, 0.6, 0, 0, 0, 1), mass=1.0), 0.1, material=soft)
+    sim = simulator(builder, dt=h)
+    z, v, lowest, found = 0.5, 0.0, 0.0, 0.0
+    for _ in range(600):
+        # p = m (v+ - v_free) >= 0, complementary to v+ + eps p + eps h k z, or v+ + eps p + z / h before it touches.
+        free, eps = v - G * h, 1 / (1e3 * h * h + 1.0 * h)
+        v = max(free, (eps * free - (z / h if z > 0 else eps * h * 1e3 * z)) / (1 + eps))
+        z += h * v
+        sim.step()
+        lowest, found = min(lowest, z), min(found, sim.q.numpy()[0, 2] - 0.1)
+    assert found == pytest.approx(lowest, abs=1e-9)
+    sim.step(9400)
+    assert sim.q.numpy()[0, 2] - 0.1 == pytest.approx(-G / 1e3, abs=5e-4)
 
 
 def test_tumbling_boxes_lose_energy_and_come_to_rest():
