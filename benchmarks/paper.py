@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import warp as wp
 from tqdm import tqdm
 
 import warp_lcp as wl
@@ -370,7 +369,8 @@ def markdown(data: dict[str, Any]) -> str:
     steps = sorted({row["h"] for row in formulations}, reverse=True)
     lines = ["### The exact cone", ""]
     exact = [row for row in formulations if row["case"] == "coulomb"]
-    head = "h | x, y [mm], yaw [mrad] against the continuous motion | an independent solver of the exact cone | largest distance [mm] on the way"
+    head = "h | x, y [mm], yaw [mrad] against the continuous motion | an independent solver of the exact cone"
+    head += " | largest distance [mm] on the way"
     rows = []
     for row in exact:
         other = SICONOS.get(row["h"])
@@ -433,7 +433,8 @@ def markdown(data: dict[str, Any]) -> str:
     )
     for unit, name in (("alpha", "scaled, rho_j = alpha (E^T A^-1 E)_jj"), ("kg", "the same for every direction, in kg")):
         lines += [f"### Phantom inertia {name}: 10 ms / 1 ms", ""]
-        head = "LCP | rho | full rank [% of steps] | numpy's own tolerance | equilibrated | condition, median | equilibrated | Lemke solves [%]"
+        head = "LCP | rho | full rank [% of steps] | numpy's own tolerance | equilibrated | condition, median | equilibrated"
+        head += " | Lemke solves [%]"
         head += " | block pivoting solves [%] | Júdice-Pires solves [%]"
         head += " | rest pose moves [um, urad]" if unit == "alpha" else " | velocity moves, at most [m/s]"
         lines += _table(head, _rho_rows([row for row in data["rho"] if row["unit"] == unit]))

@@ -65,14 +65,15 @@ def _parser() -> _Parser:
     for command in (info, run):
         command.add_argument("scene", metavar="SCENE", help="a USD file or the name of a shipped scene")
         command.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
+        add = command.add_argument
+        add("--formulation", default="phantom_inertia", metavar="F", help="contact law (default phantom_inertia)")
+        add("--sliding", default="regularized", metavar="S", help="sliding contacts: regularized (default), aligned or facets")
+        add("--directions", type=int, default=2, metavar="K", help="friction directions of a sticking contact (default 2)")
     add = run.add_argument
     add("--envs", type=int, default=1, metavar="N", help="environments, all alike (default 1)")
     add("--dt", type=float, default=1e-3, metavar="S", help="step size in seconds (default 0.001)")
     add("--duration", type=float, default=1.0, metavar="S", help="simulated seconds (default 1)")
-    add("--formulation", default="phantom_inertia", metavar="F", help="contact law (default phantom_inertia)")
     add("--method", default="auto", metavar="M", help="how the contact problem is solved (default auto)")
-    add("--sliding", default="regularized", metavar="S", help="sliding contacts: regularized (default), aligned or facets")
-    add("--directions", type=int, default=2, metavar="K", help="friction directions of a sticking contact (default 2)")
     add("--rho-scale", type=float, default=1.0, metavar="A", help="scale of the phantom inertia (default 1)")
     add("--precision", default="float64", metavar="P", help="float64 (default) or float32")
     add("--integrator", default="euler", metavar="I", help="euler (default) or midpoint")
@@ -94,7 +95,8 @@ def _parser() -> _Parser:
 def _info(arguments: argparse.Namespace) -> int:
     from .usd import read_usd
 
-    facts = describe(read_usd(arguments.scene))
+    law = {name: getattr(arguments, name) for name in ("formulation", "sliding", "directions")}
+    facts = describe(read_usd(arguments.scene), **law)
     if arguments.json:
         print(json.dumps(facts))
     else:
@@ -102,14 +104,21 @@ def _info(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def describe(reading: SceneReading) -> dict[str, Any]:
-    """What ``warp-lcp info`` says about a scene, ready for JSON; SI units.
+def describe(
+    reading: SceneReading, formulation: str = "phantom_inertia", sliding: str = "regularized", directions: int = 2
+) -> dict[str, Any]:
+    """What ``warp-lcp info`` says about a scene and what running it under a contact law takes, ready for JSON; SI units.
 
-    What depends on the whole model (dofs, pairs, contact slots, bytes) is None where the scene cannot be simulated.
+    What depends on the whole model (dofs, pairs, contact slots, bytes) is None where the scene cannot be simulated; the largest
+    LCP is also None where the law is none.
 
     Raises:
         SceneError: there is no physics in the stage.
+        WarpLcpError: there is no such contact law.
     """
+    from .simulator import friction_of
+
+    friction = friction_of(formulation, sliding, directions)
     if not (reading.bodies or reading.shapes or reading.joints):
         from .usd import load_usd
 
@@ -127,15 +136,29 @@ def describe(reading: SceneReading) -> dict[str, Any]:
     facts |= {"dofs": None, "shapes": [{"name": n, "type": None, "body": None} for n in reading.shapes], "pairs": None}
     facts |= {"contact_slots": None, "max_contacts": None, "largest_lcp": None, "bytes_per_env": None, "kernels": None}
     if model is not None:
-        facts |= _model_facts(model)
+        facts |= _model_facts(model, formulation, directions)
+    facts["friction"] = friction
     facts |= {"mass": reading.mass, "gravity": list(reading.gravity), "up_axis": reading.up_axis}
     facts |= {"meters_per_unit": reading.meters_per_unit, "kilograms_per_unit": reading.kilograms_per_unit}
     facts |= {"notes": list(report.notes), "ignored": [asdict(i) for i in report.ignored]}
     return facts | {"unsupported": [asdict(i) for i in report.unsupported]}
 
 
-def _model_facts(model: Model) -> dict[str, Any]:
+def largest_lcp(contacts: int, formulation: str, directions: int) -> int | None:
+    """Unknowns of the largest LCP of a law; None for the cone, which is not one.
+
+    One normal impulse a contact, and for its k directions two slip parameters each (eq. 35), two impulses each and a slip (ref. 6
+    of the paper), or two bounded impulses in a mixed LCP (box and hybrid).
+    """
     from .methods import LCP_UNKNOWNS
+
+    if formulation == "phantom_inertia":  # the one that is assembled, up to a size
+        return min(contacts, LCP_UNKNOWNS // (1 + 2 * directions)) * (1 + 2 * directions)
+    each = {"anitescu_potra": 2 + 2 * directions, "box": 3, "hybrid": 3}
+    return contacts * each[formulation] if formulation in each else None
+
+
+def _model_facts(model: Model, formulation: str, directions: int) -> dict[str, Any]:
     from .model import JointType, ShapeType
     from .simulator import kernel_names
 
@@ -154,9 +177,9 @@ def _model_facts(model: Model) -> dict[str, Any]:
         "pairs": [[model.shape_names[a], model.shape_names[b]] for a, b in model.pairs],
         "contact_slots": model.num_slots,
         "max_contacts": model.max_contacts,
-        "largest_lcp": min(model.max_contacts, LCP_UNKNOWNS // 5) * 5,  # a normal unknown and two for each of k = 2 directions
-        "bytes_per_env": bytes_per_env(model),
-        "kernels": kernel_names(model),
+        "largest_lcp": largest_lcp(model.max_contacts, formulation, directions),
+        "bytes_per_env": bytes_per_env(model, formulation),
+        "kernels": kernel_names(model),  # the same for every law: kernels/friction.py takes it as a number
     }
 
 
@@ -179,6 +202,14 @@ def bytes_per_env(model: Model, formulation: str = "phantom_inertia") -> int:
     return total
 
 
+def _shown_lcp(facts: dict[str, Any]) -> str:
+    if not facts["simulable"]:
+        return "?"
+    if facts["largest_lcp"] is None:
+        return f"none, the cone itself ({facts['max_contacts']} contacts)"
+    return f"{facts['largest_lcp']} unknowns ({facts['max_contacts']} contacts)"
+
+
 def _print_info(facts: dict[str, Any]) -> None:
     from rich.markup import escape
 
@@ -193,9 +224,8 @@ def _print_info(facts: dict[str, Any]) -> None:
         "degrees of freedom": _shown(facts["dofs"]),
         "shape pairs": "?" if facts["pairs"] is None else str(len(facts["pairs"])),
         "contact slots": _shown(facts["contact_slots"]),
-        "largest LCP": "?"
-        if facts["largest_lcp"] is None
-        else f"{facts['largest_lcp']} unknowns ({facts['max_contacts']} contacts, k = 2)",
+        "friction": facts["friction"],
+        "largest LCP": _shown_lcp(facts),
         "memory": "?"
         if facts["bytes_per_env"] is None
         else f"{facts['bytes_per_env']} bytes an environment, without the method's workspace",
@@ -314,7 +344,7 @@ def _simulator(model: Model, arguments: argparse.Namespace) -> Simulator:
     if arguments.device not in (None, *devices):
         raise WarpLcpError(f"--device {arguments.device}: there is no such device; choose from: {', '.join(devices)}")
     device = wp.get_device(arguments.device)
-    needed, there = arguments.envs * bytes_per_env(model), _memory() if device.is_cpu else device.free_memory
+    needed, there = arguments.envs * bytes_per_env(model, arguments.formulation), _memory() if device.is_cpu else device.free_memory
     if needed > there:
         raise WarpLcpError(f"--envs {arguments.envs} takes {needed / 1e9:.3g} GB, {device} has {there / 1e9:.3g} GB; give fewer")
     with _status("compiling kernels (first run only)"):

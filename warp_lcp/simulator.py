@@ -123,15 +123,12 @@ class Simulator:
         device: Any = None,
         strict: bool = False,
     ):
-        _choice("formulation", formulation, FORMULATIONS)
+        check_law(formulation, sliding, directions)
         _choice("method", method, tuple(METHODS))
-        _choice("sliding", sliding, SLIDING)
         _choice("precision", precision, tuple(PRECISIONS))
         _choice("integrator", integrator, INTEGRATORS)
         if int(num_envs) != num_envs or num_envs < 1:
             raise WarpLcpError(f"num_envs is {num_envs}; give a whole number of at least 1")
-        if int(directions) != directions or directions < 2:
-            raise WarpLcpError(f"directions is {directions}; give a whole number of at least 2")
         if not (np.isfinite(dt) and dt > 0.0):
             raise WarpLcpError(f"dt is {dt} s; it must be finite and greater than zero")
         if not (np.isfinite(rho_scale) and rho_scale > 0.0):
@@ -467,6 +464,46 @@ def _law(formulation: str, sliding: str, directions: int) -> tuple[int, int, int
         "hybrid": (SLIDING.index("regularized"), directions, 1),
         "coulomb": (len(SLIDING), 1, 0),
     }[formulation]
+
+
+def check_law(formulation: str, sliding: str, directions: int) -> None:
+    """Is there such a contact law?
+
+    Raises:
+        WarpLcpError: if not; says what there is.
+    """
+    _choice("formulation", formulation, FORMULATIONS)
+    _choice("sliding", sliding, SLIDING)
+    if int(directions) != directions or directions < 2:
+        raise WarpLcpError(f"directions is {directions}; give a whole number of at least 2")
+
+
+def friction_of(formulation: str = "phantom_inertia", sliding: str = "regularized", directions: int = 2) -> str:
+    """One line: how isotropic friction is under a contact law.
+
+    Half-way between two of k fixed directions a polygon around the cone has mu / cos(pi / 2k), one within it mu cos(pi / 2k);
+    distances of stopping are as its inverse (measured: tests/test_formulations.py).
+    """
+    check_law(formulation, sliding, directions)
+    least = float(np.cos(0.5 * np.pi / directions))
+    less, more = f"{100 * (1 - least):.2g} %", f"{100 * (1 / least - 1):.2g} %"
+    around = f"fixed facets around the cone, from world x, +{more} friction between directions (stops up to {less} too early)"
+    sticking = f"the limit of a sticking contact is exact along the predicted slip (k = {directions}: at most +{more} elsewhere)"
+    frozen = "limits follow the normal force of the step before"
+    if formulation == "coulomb":
+        return "coulomb: exact"
+    if formulation == "anitescu_potra":
+        within = f"fixed facets within the cone, from world x, -{less} friction between directions (stops up to {more} too far)"
+        return f"anitescu_potra, k = {directions}: {within}"
+    if formulation == "box":
+        return f"box, k = {directions}: {around}; {frozen}"
+    if formulation == "hybrid":
+        return f"hybrid: isotropic while sliding; {sticking}; {frozen}"
+    return {
+        "facets": f"phantom_inertia, facets, k = {directions}: {around}",
+        "aligned": f"phantom_inertia, aligned: isotropic while sliding, no friction across the slip; {sticking}",
+        "regularized": f"phantom_inertia, regularized: isotropic while sliding; {sticking}",
+    }[sliding]
 
 
 def _choice(what: str, value: str, choices: tuple[str, ...]) -> None:
