@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from conftest import GRAVITY, block_on_plane, paper_box, simulator, yaw
 
+import warp_lcp as wl
+
 SPEED, MU = 2.0, 0.5
 # Rest pose (x, y, yaw) of the paper's box by an independent exact-cone stepper (Siconos, normals relaxed as here), less the
 # continuous motion, which rests at (0.4406458032, 1.5839676389, 1.9534724273); published to three digits.
@@ -50,6 +52,13 @@ def test_methods_agree(formulation):
     poses = [rest(5e-3, formulation=formulation, method=method) for method in ("velocity_pivoting", "proximal_newton")]
     np.testing.assert_allclose(poses[0][0], poses[1][0], atol=1e-7)
     assert [bad for _, bad in poses] == [0, 0]
+
+
+@pytest.mark.parametrize("formulation", ["anitescu_potra", "box", "hybrid", "coulomb"])
+def test_lemke_is_for_the_lcp_of_phantom_inertia_alone(formulation):
+    """Its assembly counts 1 + 2k unknowns a contact, and k is negative where facets lie within the cone: it wrote out of bounds."""
+    with pytest.raises(wl.WarpLcpError, match="choose auto or proximal_newton"):
+        simulator(paper_box(), formulation=formulation, method="lemke")
 
 
 @pytest.mark.parametrize("formulation", ["coulomb", "phantom_inertia"])

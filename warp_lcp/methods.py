@@ -179,6 +179,9 @@ METHODS: dict[str, tuple[type, ...]] = {
     "pgs": (BlockPGS,),
 }
 
+#: Those that assemble the LCP of eq. 39, which no other formulation than 'phantom_inertia' has.
+ASSEMBLING = ("lemke",)
+
 
 def chosen(name: str, precision: str) -> tuple[type, ...]:
     """The methods behind a name.

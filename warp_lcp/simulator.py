@@ -15,7 +15,7 @@ import warp as wp
 from .errors import SimulationError, WarpLcpError
 from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset
 from .kernels.types import scalar_types
-from .methods import METHODS, chosen
+from .methods import ASSEMBLING, METHODS, chosen
 from .model import Model, ShapeType
 from .rollout import Recorder, Rollout
 
@@ -127,6 +127,8 @@ class Simulator:
         _choice("method", method, tuple(METHODS))
         _choice("precision", precision, tuple(PRECISIONS))
         _choice("integrator", integrator, INTEGRATORS)
+        if method in ASSEMBLING and formulation != "phantom_inertia":
+            raise WarpLcpError(f"method {method!r} solves the LCP of 'phantom_inertia'; for {formulation!r} choose auto or proximal_newton")
         if int(num_envs) != num_envs or num_envs < 1:
             raise WarpLcpError(f"num_envs is {num_envs}; give a whole number of at least 1")
         if not (np.isfinite(dt) and dt > 0.0):
