@@ -360,7 +360,7 @@ def _number(x: float) -> str:
 
 def _length(x: float) -> str:
     """Millimetres or milliradians."""
-    return f"{1e3 * x:+.3f}" if abs(x) < 0.1 else f"{1e3 * x:+.1f}"
+    return f"{1e3 * x:+.3f}" if abs(x) < 0.01 else f"{1e3 * x:+.1f}"
 
 
 def markdown(data: dict[str, Any]) -> str:
@@ -444,8 +444,10 @@ def markdown(data: dict[str, Any]) -> str:
 def _rho_rows(rows: list[dict[str, Any]]) -> Iterable[str]:
     for case in dict.fromkeys(row["case"] for row in rows):
         sizes = list(dict.fromkeys(row["rho"] for row in rows))
-        # Every decade for the two laws that the paper itself runs, every fourth for the others; all are in the JSON file.
-        for rho in sizes if case in (SCANNED[0].name, REGULARIZED.name) else sizes[:: max(1, len(sizes) // 4)]:
+        # Every decade of kilograms for the two laws that the paper itself runs, fewer elsewhere; all are in the JSON file.
+        main = case in (SCANNED[0].name, REGULARIZED.name)
+        stride = (1 if rows[0]["unit"] == "kg" else 2) if main else 4
+        for rho in sizes[:: stride if len(sizes) > 5 else 1]:
             pair = [row for row in rows if (row["case"], row["rho"]) == (case, rho)]
             columns = [" / ".join(_share(row[key]) for row in pair) for key in ("full", "full_default", "full_equilibrated")]
             columns += [" / ".join(_number(row[key][0]) for row in pair) for key in ("condition", "condition_equilibrated")]
