@@ -1,49 +1,118 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks speed|resources|paper [--quick] [--out DIR]"""
+"""python -m benchmarks speed|resources|lcp|paper|peers [--help]"""
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
+from typing import Any
 
 import warp as wp
 
-from . import paper, paper_picture, report, resources, speed
+from . import lcp, paper, paper_picture, peers, report, resources, speed
+from .peers import compare
+
+
+def peer_names(text: str) -> list[str]:
+    """'all', 'none' or names with commas between them."""
+    names = {"all": list(peers.PEERS), "none": []}.get(text, text.split(","))
+    for name in names:
+        if name not in peers.PEERS:
+            raise argparse.ArgumentTypeError(f"no peer {name!r}; choose from {', '.join(peers.PEERS)}, or all, or none")
+    return names
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure warp_lcp; results go to a JSON file.")
+    out = argparse.ArgumentParser(add_help=False)
+    out.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder of the JSON file")
+    quick = argparse.ArgumentParser(add_help=False)
+    quick.add_argument("--quick", action="store_true", help="fewer batch sizes and repetitions")
+    place = argparse.ArgumentParser(add_help=False)
+    place.add_argument("--dir", type=Path, default=peers.FOLDER, help="folder of the peers' interpreters")
+    commands = parser.add_subparsers(dest="what", required=True)
+
+    timing = commands.add_parser("speed", parents=[out, quick, place], help="env-steps/s of the paper's box, start-up, peers")
+    timing.add_argument("--device", default=None, help="Warp device (default: Warp's); peers are compared on the CPU")
+    timing.add_argument(
+        "--peers", type=peer_names, default="all", metavar="all|none|NAME,...", help="those that are installed (default: all)"
+    )
+    recorded = commands.add_parser("lcp", parents=[out, quick], help="every method for LCPs on recorded problems")
+    recorded.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
+    commands.add_parser("resources", parents=[out], help="what the kernels take of a GPU")
+    comparison = commands.add_parser("paper", parents=[quick], help="the paper's own comparison: formulations, lead matrices, Fig. 4")
+    comparison.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
+    others = commands.add_parser("peers", help="other engines on the same scenes").add_subparsers(dest="action", required=True)
+    for action, parents, what in (
+        ("install", [place], "make the interpreters of the peers, with pip"),
+        ("compare", [out, quick, place], "the peers' table of 'speed' alone"),
+    ):
+        sub = others.add_parser(action, parents=parents, help=what)
+        sub.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(peers.PEERS)} (default: all)")
+    found = parser.parse_args()
+    if found.what == "peers":
+        try:
+            found.names = peer_names(",".join(found.names) or "all")
+        except argparse.ArgumentTypeError as error:
+            parser.error(str(error))
+    return found
+
+
+def compared(names: list[str], quick: bool, folder: Path) -> dict[str, Any]:
+    """The comparison with those of the named peers that are installed, printed; {} if none is."""
+    present, absent = peers.split(names, folder)
+    if absent:
+        print(f"\n{absent}")
+    if not present:
+        return {}
+    rows = compare.measure(present, quick, folder)
+    print(f"\n{compare.markdown(rows)}")
+    return {"peers": rows, "peers_device": report.processor()}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure warp_lcp; results go to a JSON file.")
-    parser.add_argument("what", choices=("speed", "resources", "paper"))
-    parser.add_argument("--quick", action="store_true", help="less of everything, under 3 minutes")
-    parser.add_argument("--device", default=None, help="Warp device (default: Warp's)")
-    parser.add_argument("--out", type=Path, help="folder of the results (default: benchmarks/results; a full paper run writes docs too)")
-    arguments = parser.parse_args()
+    asked = arguments()
     wp.config.log_level = wp.LOG_WARNING
-    device = wp.get_device(arguments.device)
-    if arguments.what == "speed":
-        rows = speed.measure(device, quick=arguments.quick)
+    if asked.what == "peers" and asked.action == "install":
+        for name in asked.names:
+            peers.PEERS[name].install(asked.dir)
+            print(f"{name}: installed in {asked.dir / name}")
+        return
+    device = wp.get_device(asked.device if asked.what == "speed" else "cpu" if asked.what == "peers" else None)
+    if asked.what == "speed":
+        rows = speed.measure(device, quick=asked.quick)
         start = speed.start_up()
-        text = speed.markdown(rows, start)
+        print(speed.markdown(rows, start))
         data = {"start_up": start, "rows": rows}
-    elif arguments.what == "paper":
-        data = paper.measure(device, arguments.quick)
-        text = paper.markdown(data)
+        report.write(asked.out, asked.what, device, data)  # kept if a peer fails
+        data |= compared(asked.peers, asked.quick, asked.dir)
+    elif asked.what == "peers":
+        data = compared(asked.names, asked.quick, asked.dir)
+        if not data:
+            return
+    elif asked.what == "paper":
+        data = paper.measure(device, asked.quick)
+        print(paper.markdown(data))
+        if asked.out or not asked.quick:  # a quick run leaves the documents of the repository alone
+            if asked.out is None:
+                paper.document(paper.markdown(data))
+            else:
+                asked.out.mkdir(parents=True, exist_ok=True)
+            paper_picture.draw(data, (asked.out or paper.DOCS) / "paper_comparison")
+        asked.out = asked.out or Path("benchmarks/results")
+    elif asked.what == "lcp":
+        try:
+            rows = lcp.measure(device, asked.problems, quick=asked.quick)
+        except FileNotFoundError as error:
+            raise SystemExit(f"python -m benchmarks: error: {error}") from error
+        print(lcp.markdown(rows))
+        data = {"rows": rows}
     else:
         table = [row for precision in ("float64", "float32") for row in resources.measure(precision)]
-        text = resources.markdown(table)
+        print(resources.markdown(table))
         data = {"rows": [vars(row) for row in table]}
-    print(text)
-    path = report.write(arguments.out or Path("benchmarks/results"), arguments.what, device, json.loads(json.dumps(data)))
-    print(f"\nwritten to {path}")
-    if arguments.what == "paper" and (arguments.out or not arguments.quick):
-        # A quick run, or one that goes elsewhere, leaves the documents of the repository alone.
-        picture = path.with_suffix("")
-        if arguments.out is None:
-            paper.document(text)
-            picture = paper.DOCS / "paper_comparison"
-        paper_picture.draw(data, picture)
-        print(f"drawn in {picture}.png and .svg")
+    print(f"\nwritten to {report.write(asked.out, asked.what, device, data)}")
 
 
 if __name__ == "__main__":

@@ -232,20 +232,11 @@ def residual(rows: Rows, p: np.ndarray) -> float:
     return worst
 
 
-def block_pivoting(problem: Problem, patience: int | None = None, limit: int = 300) -> tuple[np.ndarray, bool]:
-    """Block principal pivoting: all infeasible pairs exchanged at once, solved afresh, until there is none.
+def block_pivoting(problem: Problem, limit: int = 100) -> tuple[np.ndarray, bool]:
+    """Block principal pivoting as it comes: all infeasible pairs exchanged at once, solved afresh, until there is none.
 
-    On the equilibrated problem, from z = 0.
-
-    Args:
-        problem: the LCP.
-        patience: None: as it comes, without safeguard. Else the safeguard of Júdice and Pires (the paper's ref. 10): where so
-            many exchanges in a row do not leave fewer infeasible pairs than there ever were, only the first of them is exchanged
-            (Murty) until there are fewer.
-        limit: exchanges at most.
-
-    Returns:
-        z, NaN where there was no end; whether a block on the way was singular.
+    On the equilibrated problem, from z = 0, without safeguard. Returns (z, whether a block on the way was singular); z is NaN
+    where there was no end.
     """
     n = len(problem.q)
     left, right = scales(problem.M)
@@ -253,7 +244,7 @@ def block_pivoting(problem: Problem, patience: int | None = None, limit: int = 3
     # A step at rest is degenerate: its tangential rows are round-off, which must not count as infeasible.
     slack = 1e-9 * np.abs(q).max()
     basic = np.zeros(n, dtype=bool)
-    singular, fewest, tries, seen = False, n + 1, 0, set()
+    singular, seen = False, {basic.tobytes()}
     for _ in range(limit):
         z = np.zeros(n)
         if basic.any():
@@ -263,28 +254,23 @@ def block_pivoting(problem: Problem, patience: int | None = None, limit: int = 3
                 z[basic] = np.linalg.solve(block, -q[basic])
             except np.linalg.LinAlgError:  # exactly singular: there is nothing to go on with
                 break
-        wrong = np.flatnonzero(np.where(basic, z < -slack, M @ z + q < -slack))
-        if len(wrong) == 0:
+        wrong = np.where(basic, z < -slack, M @ z + q < -slack)
+        if not wrong.any():
             return right * z, singular
-        if len(wrong) < fewest:
-            fewest, tries, seen = len(wrong), 0, set()
-        else:
-            tries += 1
-        single = patience is not None and tries > patience
-        if single or patience is None:
-            if (single, basic.tobytes()) in seen:  # the same sets follow for ever
-                break
-            seen.add((single, basic.tobytes()))
-        basic[wrong[:1] if single else wrong] ^= True
+        basic = basic ^ wrong
+        if basic.tobytes() in seen:  # the same sets follow for ever
+            break
+        seen.add(basic.tobytes())
     return np.full(n, np.nan), singular
 
 
-def solve_lemke(problems: list[Problem]) -> list[np.ndarray]:
+def solve(problems: list[Problem], method: str) -> list[np.ndarray]:
     """Answers of wl.solve_lcp, problems of one size in one batch."""
     answers: list[np.ndarray] = [np.empty(0)] * len(problems)
     for size in {len(p.q) for p in problems}:
         chosen = [i for i, p in enumerate(problems) if len(p.q) == size]
-        z = wl.solve_lcp(np.array([problems[i].M for i in chosen]), np.array([problems[i].q for i in chosen]), device="cpu").z.numpy()
+        M, q = np.array([problems[i].M for i in chosen]), np.array([problems[i].q for i in chosen])
+        z = wl.solve_lcp(M, q, method, device="cpu").z.numpy()
         for i, x in zip(chosen, z, strict=True):
             answers[i] = x
     return answers

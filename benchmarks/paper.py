@@ -17,6 +17,8 @@ import numpy as np
 from tqdm import tqdm
 
 import warp_lcp as wl
+from warp_lcp.laws import Law
+from warp_lcp.methods import LCP_METHODS
 
 from . import lead_matrix as lead
 from .speed import box
@@ -26,10 +28,8 @@ BEGIN, END = "<!-- tables of `python -m benchmarks paper` -->\n", "<!-- end of t
 DURATION = 0.8  # s; the continuous motion rests at 0.661 s
 STIFFNESS = 1e10  # N/m, k_n
 GRAVITY, MU, INERTIA, HALF, SPEED, SPIN = 9.81, 1.0, 1.0 / 6.0, 0.5, 5.0, 2.0 * np.pi  # of the box, m = 1 kg
-METHODS = ("auto", "lemke", "velocity_pivoting", "proximal_newton", "pgs")
+METHODS = ("auto", "lemke", "judice_pires", "murty", "velocity_pivoting", "proximal_newton", "pgs")
 HEADINGS = np.linspace(0.0, np.pi / 2, 16, endpoint=False)
-#: Block exchanges without progress before Murty's single ones, as in the paper's ref. 10.
-PATIENCE = 10
 #: Rest pose (x, y [m], yaw [rad]) of an exact-cone stepper that is not ours (Siconos, normals relaxed as here) less the continuous
 #: one, published to three digits: what `coulomb` is held against.
 SICONOS = {1e-2: (-2.74e-3, -27.0e-3, -28.7e-3), 1e-3: (-0.28e-3, -2.72e-3, -2.84e-3)}
@@ -50,12 +50,9 @@ class Case:
         return wl.Simulator(box(), envs, h, self.formulation, method, device=device, **options)
 
     def takes(self, method: str) -> bool:
-        """Is the method made for this law? The assembled LCP is the paper's; velocity pivoting knows two axes a contact or the disc."""
-        if method == "lemke":
-            return self.formulation == "phantom_inertia"
-        if method == "velocity_pivoting":
-            return self.formulation != "anitescu_potra" and self.directions == 2
-        return True
+        """Is the method made for this law?"""
+        law = Law(self.formulation, self.sliding, self.directions)
+        return law.has_axes if method == "velocity_pivoting" else not (law.is_cone and method in LCP_METHODS)
 
 
 def _ap(k: int) -> Case:
@@ -268,7 +265,7 @@ def measure_matrices(device: Any, quick: bool) -> list[dict[str, Any]]:
             rows = recorded(case, h, device, every=1 if h == 1e-2 else 20 if quick else 4)
             problems = [case.problem(r) for r in rows]
             raw, even = [lead.rank(p.M) for p in problems], [lead.rank(lead.equilibrated(p.M)) for p in problems]
-            blocks, guarded = ([lead.block_pivoting(p, patience) for p in problems] for patience in (None, PATIENCE))
+            blocks = [lead.block_pivoting(p) for p in problems]
             result.append(
                 {
                     "case": case.name,
@@ -280,9 +277,8 @@ def measure_matrices(device: Any, quick: bool) -> list[dict[str, Any]]:
                     "condition": spread(c for _, c in raw),
                     "condition_equilibrated": spread(c for _, c in even),
                     "block_pivoting": float(np.mean(judged(rows, problems, [z for z, _ in blocks])[0])),
-                    "guarded_pivoting": float(np.mean(judged(rows, problems, [z for z, _ in guarded])[0])),
                     "singular_blocks": float(np.mean([singular for _, singular in blocks])),
-                    "lemke": float(np.mean(judged(rows, problems, lead.solve_lemke(problems))[0])),
+                    **{m: float(np.mean(judged(rows, problems, lead.solve(problems, m))[0])) for m in LCP_METHODS},
                 }
             )
     return result
@@ -301,7 +297,7 @@ def measure_rho(device: Any, quick: bool) -> list[dict[str, Any]]:
                     alpha, kilograms = (float(size), 0.0) if unit == "alpha" else (None, float(size))
                     problems = [lead.phantom_inertia(r, alpha, kilograms) for r in rows]
                     even = [lead.rank(lead.equilibrated(p.M)) for p in problems]
-                    solved, moved = judged(rows, problems, lead.solve_lemke(problems))
+                    solved, moved = judged(rows, problems, lead.solve(problems, "lemke"))
                     row = {"case": case.name, "h": h, "unit": unit, "rho": float(size), "steps": len(rows)}
                     row["full"] = _full(problems, [lead.rank(p.M) for p in problems])
                     row["full_default"] = _full(problems, [lead.rank(p.M, lead.default_tolerance(p.M)) for p in problems])
@@ -311,9 +307,8 @@ def measure_rho(device: Any, quick: bool) -> list[dict[str, Any]]:
                         spread(c for _, c in even),
                     )
                     row["lemke"] = float(np.mean(solved))
-                    for name, patience in (("block_pivoting", None), ("guarded_pivoting", PATIENCE)):
-                        answers = [lead.block_pivoting(p, patience)[0] for p in problems]
-                        row[name] = float(np.mean(judged(rows, problems, answers)[0]))
+                    row["judice_pires"] = float(np.mean(judged(rows, problems, lead.solve(problems, "judice_pires"))[0]))
+                    row["block_pivoting"] = float(np.mean(judged(rows, problems, [lead.block_pivoting(p)[0] for p in problems])[0]))
                     row["velocity_change"] = max((m for m, ok in zip(moved, solved, strict=True) if ok), default=None)
                     if unit == "alpha":
                         whole = run(case, h, device, "lemke", rho_scale=float(size))
@@ -420,14 +415,14 @@ def markdown(data: dict[str, Any]) -> str:
     lines += ["### Lead matrices over the steps of a run, median / worst", ""]
     head = "LCP | h [ms] | unknowns | rank missing | condition | equilibrated: rank missing | condition"
     lines += _table(
-        head + " | Lemke solves [%] | block pivoting solves [%] | with a singular block [%] | Júdice-Pires solves [%]",
+        head + " | Lemke solves [%] | block pivoting solves [%] | with a singular block [%] | Júdice-Pires [%] | Murty [%]",
         (
             f"{row['case']} | {1e3 * row['h']:g} | {row['unknowns'][0]:.0f} / {row['unknowns'][1]:.0f} | "
             f"{row['deficiency'][0]:.0f} / {row['deficiency'][1]:.0f} | {_number(row['condition'][0])} / {_number(row['condition'][1])} | "
             f"{row['deficiency_equilibrated'][0]:.0f} / {row['deficiency_equilibrated'][1]:.0f} | "
             f"{_number(row['condition_equilibrated'][0])} / {_number(row['condition_equilibrated'][1])} | "
             f"{_share(row['lemke'])} | {_share(row['block_pivoting'])} | {_share(row['singular_blocks'])} | "
-            f"{_share(row['guarded_pivoting'])}"
+            f"{_share(row['judice_pires'])} | {_share(row['murty'])}"
             for row in data["matrices"]
         ),
     )
@@ -452,7 +447,7 @@ def _rho_rows(rows: list[dict[str, Any]]) -> Iterable[str]:
             columns = [" / ".join(_share(row[key]) for row in pair) for key in ("full", "full_default", "full_equilibrated")]
             columns += [" / ".join(_number(row[key][0]) for row in pair) for key in ("condition", "condition_equilibrated")]
             solved = "run_certified" if pair[0]["unit"] == "alpha" else "lemke"
-            columns += [" / ".join(_share(row[key]) for row in pair) for key in (solved, "block_pivoting", "guarded_pivoting")]
+            columns += [" / ".join(_share(row[key]) for row in pair) for key in (solved, "block_pivoting", "judice_pires")]
             if pair[0]["unit"] == "alpha":
                 columns += [" / ".join(f"{1e6 * row['rest_change']:.2g}" for row in pair)]
             else:

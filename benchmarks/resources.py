@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import warp as wp
-from warp_lcp.kernels import lemke, problems, record, watch
+from warp_lcp.kernels import contact_problem, lcp, record, solve_batch, watch
 
 import warp_lcp as wl
 from warp_lcp.methods import METHODS
@@ -50,15 +50,19 @@ def scenes() -> list[wl.Model]:
 
 
 def kernels(precision: str) -> dict[str, wp.Kernel]:
-    """Every kernel of one precision by its name."""
+    """Every kernel of one precision by its name; those that a method is built into as name[method]."""
     real = PRECISIONS[precision][0]
-    found = [lemke.make(real), problems.make(real), watch.collect_status]
-    found += [part for part in vars(record.make(real)).values() if isinstance(part, wp.Kernel)]
+    found = {"collect_status": watch.collect_status, "solve_contacts": contact_problem.make(real)}
+    found |= {name: part for name, part in vars(record.make(real)).items() if isinstance(part, wp.Kernel)}
+    found |= {f"solve_batch[{method}]": solve_batch.make(real, method) for method in solve_batch.SOLVERS}
+    found |= {f"assembled_lcp[{method}]": lcp.make(real, method) for method in ("lemke", "murty", "judice_pires")}
     for model in scenes():
-        for method in (m for m in METHODS if precision == "float64" or m != "velocity_pivoting"):
-            found += wl.Simulator(model, method=method, precision=precision, device="cpu").kernels
-        found += wl.Simulator(model, method="pgs", precision=precision, integrator="midpoint", device="cpu").kernels
-    return {kernel.key.split("__")[-1]: kernel for kernel in found}
+        options = [{"method": m} for m in METHODS if precision == "float64" or m != "velocity_pivoting"]
+        for option in (*options, {"method": "pgs", "integrator": "midpoint"}):
+            for kernel in wl.Simulator(model, precision=precision, device="cpu", **option).kernels:
+                if kernel not in found.values():
+                    found[kernel.key.split("__")[-1]] = kernel
+    return found
 
 
 def cuobjdump() -> str:

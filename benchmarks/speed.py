@@ -21,11 +21,9 @@ import numpy as np
 import warp as wp
 from tqdm import tqdm
 
-import warp_lcp as wl
+from . import scenes
+from .scenes import STATES, STEPS
 
-DT = 1e-3
-STATES = ("rest", "slide", "tumble")
-STEPS = {"rest": 50, "slide": 50, "tumble": 250}
 SIZES = (1, 64, 1024, 8192)
 COMBINATIONS = (
     ("auto", "float64"),
@@ -38,37 +36,11 @@ COMBINATIONS = (
 SECONDS = 2.0  # after this long a combination is not repeated again
 
 
-def box() -> wl.Model:
-    """The paper's box (Table 1)."""
-    builder, rough = wl.ModelBuilder(), wl.Material(1.0, 1.0)
-    builder.add_plane(material=rough)
-    body = builder.add_body(pose=(0, 0, 0.5, 0, 0, 0, 1), velocity=(0, 5, 0), angular_velocity=(0, 0, 2 * np.pi), mass=1.0)
-    builder.add_box(body, (0.5, 0.5, 0.5), material=rough)
-    return builder.finalize()
-
-
-def start(sim: wl.Simulator, state: str) -> None:
-    """Write the start of a state into q0, v0; tumbling boxes differ from one environment to the next."""
-    rng, envs = np.random.default_rng(0), sim.num_envs
-    q, v = np.tile(sim.model.q0, (envs, 1)), np.tile(sim.model.v0, (envs, 1))
-    if state == "rest":
-        v[:] = 0.0
-    elif state == "tumble":
-        turn = rng.normal(size=(envs, 4))
-        q[:, 2], q[:, 3:] = rng.uniform(0.87, 1.1, envs), turn / np.linalg.norm(turn, axis=1)[:, None]
-        v = rng.normal(size=(envs, 6)) * 2.0
-        v[:, 2] = -rng.uniform(1.0, 3.0, envs)
-    sim.q0.assign(q)
-    sim.v0.assign(v)
-
-
 def one(device: wp.Device, state: str, envs: int, method: str, precision: str, repetitions: int) -> dict[str, Any]:
     """Measure one combination."""
-    sim = wl.Simulator(box(), envs, DT, method=method, precision=precision, device=device)
-    start(sim, state)
+    sim = scenes.scene(state, envs).simulator(method=method, precision=precision, device=device)
     steps = STEPS[state]
     runs = max(1, 200 // envs)  # of a few environments, timed together
-    sim.reset()
     sim.step(2)
     rates, status, residual = [], np.zeros(envs, dtype=np.int32), 0.0
     finish = time.perf_counter() + SECONDS
@@ -110,8 +82,9 @@ def start_up() -> dict[str, float]:
     """Seconds of a fresh process: import, first step with a cold kernel cache, first step with a warm one."""
     code = (
         "import time; a = time.perf_counter(); import warp_lcp as wl; wl.Simulator; b = time.perf_counter();"
-        "import warp as wp; wp.config.log_level = wp.LOG_WARNING; from benchmarks.speed import box;"
-        "c = time.perf_counter(); sim = wl.Simulator(box(), device='cpu'); sim.step(); sim.q.numpy(); print(b - a, time.perf_counter() - c)"
+        "import warp as wp; wp.config.log_level = wp.LOG_WARNING; from benchmarks import scenes;"
+        "c = time.perf_counter(); sim = scenes.scene('slide', 1).simulator(device='cpu'); sim.step(); sim.q.numpy();"
+        "print(b - a, time.perf_counter() - c)"
     )
     result = {}
     with tempfile.TemporaryDirectory() as cache:

@@ -32,7 +32,7 @@ def make(real):
     law = friction.functions(real)
     project_friction, weigh, law_error = law.project_friction, law.weigh, law.law_error
     body = rigid.functions(real)
-    point_velocity, impulse_response = body.point_velocity, body.impulse_response
+    point_velocity, wrench, response = body.point_velocity, body.wrench, body.response
 
     @wp.func
     def contact_state(p: vec3, mu: vec2, bound: vec2, k: int) -> int:
@@ -76,24 +76,21 @@ def make(real):
             restored = bool(False)
             while judging:
                 judging = False
+                # The wrench of all impulses on each body, then what it changes: next_velocity holds v+ - v_free until the end.
                 for b in range(next_velocity.shape[1]):
-                    next_velocity[env, b] = bodies.free_velocity[env, b]
+                    next_velocity[env, b] = spatial()
                 for i in range(r):
                     impulse = wp.transpose(contacts.frame[env, i]) * contacts.impulse[env, i]
                     for side in range(2):
                         b = contacts.body[env, i][side]
                         if b >= 0:
                             arm = contacts.point[env, i] - bodies.com[env, b]
-                            sign = real(2 * side - 1)
-                            next_velocity[env, b] += impulse_response(
-                                bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * impulse
-                            )
+                            next_velocity[env, b] += real(2 * side - 1) * wrench(arm, impulse)
+                for b in range(next_velocity.shape[1]):
+                    next_velocity[env, b] = response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], next_velocity[env, b])
 
                 worst = real(0.0)
                 energy = real(0.0)
-                finite = bool(True)
-                for b in range(next_velocity.shape[1]):
-                    finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
                 for i in range(r):
                     p = contacts.impulse[env, i]
                     eps = contacts.relaxation[env, i]
@@ -102,7 +99,7 @@ def make(real):
                         b = contacts.body[env, i][side]
                         if b >= 0:
                             arm = contacts.point[env, i] - bodies.com[env, b]
-                            du += real(2 * side - 1) * point_velocity(next_velocity[env, b] - bodies.free_velocity[env, b], arm)
+                            du += real(2 * side - 1) * point_velocity(next_velocity[env, b], arm)
                     relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
                     k = contacts.directions[env, i]
                     mu = contacts.mu[env, i]
@@ -113,6 +110,10 @@ def make(real):
                     energy += real(0.5) * wp.dot(wp.cw_div(error, w), error)
                     contacts.velocity[env, i] = relaxed - wp.cw_mul(eps, p) - contacts.shift[env, i]
                     contacts.state[env, i] = contact_state(p, mu, bound, k)
+                finite = bool(True)
+                for b in range(next_velocity.shape[1]):
+                    next_velocity[env, b] = bodies.free_velocity[env, b] + next_velocity[env, b]
+                    finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
                 if not finite:
                     worst = real(HUGE)
 

@@ -32,8 +32,7 @@ IMPULSE_FLOOR = wp.constant(1.0e-2)
 def row_functions(real) -> SimpleNamespace:
     """What a contact row is made of."""
     t = scalar_types(real)
-    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
-    vec5 = wp.types.vector(length=5, dtype=real)
+    vec2, vec3, vec5, mat33 = t.vec2, t.vec3, t.vec5, t.mat33
     body = rigid.functions(real)
 
     @wp.struct
@@ -47,7 +46,6 @@ def row_functions(real) -> SimpleNamespace:
     @wp.struct
     class Row:
         frame: mat33
-        inv_mass: vec3
         relaxation: vec3
         shift: vec3
         mu: vec2
@@ -95,7 +93,7 @@ def row_functions(real) -> SimpleNamespace:
 
     @wp.func
     def make_row(
-        mobility: mat33,
+        w_nn: real,
         n: vec3,
         phi: real,
         bend: real,
@@ -112,15 +110,13 @@ def row_functions(real) -> SimpleNamespace:
     ) -> Row:
         """Row of one contact; u and u_free: present and free velocity of b relative to a, world axes; g = |gravity|.
 
-        directions: the set that a sticking contact admits (kernels/friction.py); frozen: its limit is mu p_n of the last step.
-
-        mobility: what J M^-1 J^T is for world axes, of both bodies together.
+        w_nn: J_n M^-1 J_n^T; directions: the set that a sticking contact admits (kernels/friction.py); frozen: its limit is mu p_n
+        of the last step.
         """
         k_n = c[0]
         b_n = c[1]
         k_t = c[2]
         b_t = c[3]
-        w_nn = wp.dot(n, mobility * n)
 
         # A new contact starts with its weight and slack bristles.
         weight = h * g / w_nn
@@ -186,7 +182,6 @@ def row_functions(real) -> SimpleNamespace:
 
         row = Row()
         row.frame = wp.matrix_from_rows(n, t1, t2)
-        row.inv_mass = vec3(w_nn, wp.dot(t1, mobility * t1), wp.dot(t2, mobility * t2))
         row.relaxation = eps
         row.shift = vec3(d_n, wp.dot(t1, d_t), wp.dot(t2, d_t))
         row.mu = mu_row
@@ -203,9 +198,8 @@ def row_functions(real) -> SimpleNamespace:
 
     return SimpleNamespace(
         History=History,
-        vec5=vec5,
         point_velocity=body.point_velocity,
-        mobility=body.mobility,
+        direction_mobility=body.direction_mobility,
         contact_parameters=contact_parameters,
         make_row=make_row,
     )
@@ -213,14 +207,36 @@ def row_functions(real) -> SimpleNamespace:
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """Kernels ``select_contacts`` (dim E) and ``contact_rows`` (dim E, R)."""
+    """Kernels ``combine_pairs`` (dim N, P), ``select_contacts`` (dim E) and ``contact_rows`` (dim E, R)."""
     t = scalar_types(real)
-    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    vec3, vec5 = t.vec3, t.vec5
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     f = row_functions(real)
-    History, vec5 = f.History, f.vec5
-    point_velocity, side_mobility, contact_parameters, make_row = f.point_velocity, f.mobility, f.contact_parameters, f.make_row
+    History, make_row, contact_parameters = f.History, f.make_row, f.contact_parameters
+    point_velocity, direction_mobility = f.point_velocity, f.direction_mobility
     shape_pose = pair_functions(real).shape_pose
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def combine_pairs(topology: Topology, parameters: Parameters):
+        """Friction and contact parameters of every pair: the mean of its two shapes' materials, or Table 1."""
+        i, pair = wp.tid()
+        mass = real(0.0)  # of the lighter movable body
+        for side in range(2):
+            b = topology.pair_body[pair][side]
+            if b >= 0 and topology.joint_type[wp.max(b, 0)] == FREE:
+                m = parameters.mass[i % parameters.mass.shape[0], b]
+                if mass == real(0.0) or m < mass:
+                    mass = m
+        a = topology.pairs[pair, 0]
+        b = topology.pairs[pair, 1]
+        e = i % parameters.friction.shape[0]
+        parameters.pair_friction[i, pair] = real(0.5) * (parameters.friction[e, a] + parameters.friction[e, b])
+        c_a = vec5()
+        c_b = vec5()
+        for k in range(5):
+            c_a[k] = parameters.contact[i % parameters.contact.shape[0], a, k]
+            c_b[k] = parameters.contact[i % parameters.contact.shape[0], b, k]
+        parameters.pair_contact[i, pair] = contact_parameters(c_a, c_b, mass)
 
     @wp.kernel(module="unique", enable_backward=False)
     def select_contacts(
@@ -242,12 +258,13 @@ def make(real) -> SimpleNamespace:
                 phi = slots.gap[env, slot]
                 if phi < real(NO_POINT):
                     pair = topology.slot_pair[slot]
+                    body = topology.pair_body[pair]
                     u = vec3()
                     u_free = vec3()
                     for side in range(2):
                         sign = real(2 * side - 1)
                         shape = topology.pairs[pair, side]
-                        b = topology.shape_body[shape]
+                        b = body[side]
                         belt = topology.surface_velocity[shape]
                         if wp.dot(belt, belt) > real(0.0):
                             belt = sign * wp.transform_vector(shape_pose(topology, bodies, env, shape), belt)
@@ -292,43 +309,39 @@ def make(real) -> SimpleNamespace:
             point = slots.point[env, slot]
             phi = slots.gap[env, slot]
             g = wp.length(parameters.gravity[env % parameters.gravity.shape[0]])
-            mobility = mat33()
-            mass = real(0.0)  # of the lighter movable body
-            mu = vec2()
-            c_a = vec5()
-            c_b = vec5()
-            body = wp.vec2i()
+            mu = parameters.pair_friction[env % parameters.pair_friction.shape[0], pair]
+            c = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair]
+            body = topology.pair_body[pair]
+            n = slots.normal[env, slot]
+            w_nn = real(0.0)
             for side in range(2):
-                shape = topology.pairs[pair, side]
-                b = topology.shape_body[shape]
-                body[side] = b
-                mu += real(0.5) * parameters.friction[env % parameters.friction.shape[0], shape]
-                for k in range(5):
-                    c_a[k] = c_b[k]
-                    c_b[k] = parameters.contact[env % parameters.contact.shape[0], shape, k]
-                if b >= 0 and topology.joint_type[b] == FREE:
-                    m = parameters.mass[env % parameters.mass.shape[0], b]
-                    arm = point - bodies.com[env, b]
-                    mobility += side_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, arm)
-                    if mass == real(0.0) or m < mass:
-                        mass = m
-            c = contact_parameters(c_a, c_b, mass)
+                b = body[side]
+                if b >= 0:
+                    w_nn += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], point - bodies.com[env, b], n)
             history = History()
             history.touched = slots.last_feature[env, slot] == slots.feature[env, slot]
             history.impulse = slots.last_impulse[env, slot]
             history.bristle = slots.last_bristle[env, slot]
             u = contacts.velocity[env, i]
             u_free = contacts.free[env, i]
-            n = slots.normal[env, slot]
             bend = slots.bend[env, slot]
-            row = make_row(mobility, n, phi, bend, u, u_free, c, mu, history, g, h, sliding, directions, frozen)
+            row = make_row(w_nn, n, phi, bend, u, u_free, c, mu, history, g, h, sliding, directions, frozen)
 
+            t1 = row.frame[1]
+            t2 = row.frame[2]
+            w = vec3(w_nn, real(0.0), real(0.0))
+            for side in range(2):
+                b = body[side]
+                if b >= 0:
+                    arm = point - bodies.com[env, b]
+                    w[1] += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, t1)
+                    w[2] += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, t2)
             contacts.body[env, i] = body
             contacts.point[env, i] = point
             contacts.gap[env, i] = phi
             contacts.closed[env, i] = int(row.closed)
             contacts.frame[env, i] = row.frame
-            contacts.inv_mass[env, i] = row.inv_mass
+            contacts.inv_mass[env, i] = w
             contacts.relaxation[env, i] = row.relaxation
             contacts.shift[env, i] = row.shift
             contacts.free[env, i] = row.frame * u_free + row.shift
@@ -341,4 +354,4 @@ def make(real) -> SimpleNamespace:
             contacts.impulse[env, i] = vec3()
             contacts.state[env, i] = row.state
 
-    return SimpleNamespace(select_contacts=select_contacts, contact_rows=contact_rows)
+    return SimpleNamespace(combine_pairs=combine_pairs, select_contacts=select_contacts, contact_rows=contact_rows)

@@ -6,7 +6,15 @@ h sigma_up. v and h lambda_t are eliminated: with W = J M^-1 J^T + epsilon, b = 
 
     h lambda_t = A^-1 (E (w_up - w_lo) - W_tn h lambda_n - b_t).
 
-Contacts without friction have the one unknown h lambda_n and no rows in A.
+Contacts without friction have the one unknown h lambda_n and no rows in A. Frozen limits (box and hybrid laws) are numbers in q
+instead of entries mu.
+
+Anitescu and Potra (ref. 6) have generators instead: h lambda_t = D beta with the 2 k directions +-e_j, and
+
+                   p_n            beta       gamma
+    u_n        [  W_nn           W_nt D        0  ]     b_n
+    D^T u_t + gamma [  D^T W_tn   D^T W_tt D   1  ]     D^T b_t          0 <= (p_n, beta, gamma) compl. w >= 0.
+    slack      [  mu              -1           0  ]     0
 """
 
 import functools
@@ -14,8 +22,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import lemke as lemke_file
-from . import linear
+from . import linear, problem
+from .solve_batch import solver
 from .types import ITERATION_LIMIT, LANES, scalar_types, sync
 
 
@@ -25,7 +33,7 @@ def functions(real) -> SimpleNamespace:
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     Bodies, Contacts = t.Bodies, t.Contacts
-    LcpWorkspace = lemke_file.functions(real).LcpWorkspace
+    LcpWorkspace = problem.functions(real).LcpWorkspace
     invert = linear.functions(real).invert
 
     @wp.struct
@@ -185,8 +193,9 @@ def functions(real) -> SimpleNamespace:
             for m in range(ki):
                 e = direction(ki, m)
                 g = ws.G[slot, 2 * fi, r] * e[0] + ws.G[slot, 2 * fi + 1, r] * e[1]
-                lcp.q[slot, si + 1 + m] = -g
-                lcp.q[slot, si + 1 + ki + m] = g
+                bound = contacts.bound[env, i][wp.min(m, 1)]
+                lcp.q[slot, si + 1 + m] = bound - g
+                lcp.q[slot, si + 1 + ki + m] = bound + g
         sync()
         return ws.start[slot, r]
 
@@ -213,21 +222,100 @@ def functions(real) -> SimpleNamespace:
             contacts.impulse[env, i] = p
         sync()
 
-    return SimpleNamespace(ContactWorkspace=ContactWorkspace, assemble=assemble, impulses=impulses, direction=direction)
+    @wp.func
+    def generator(k: int, column: int) -> vec3:
+        """Impulse (n, t1, t2) of one unknown of a contact: p_n, beta_0, ..., beta_{2k-1}, gamma (none)."""
+        g = vec3()
+        if column == 0:
+            g[0] = real(1.0)
+        elif column <= 2 * k:
+            e = direction(k, (column - 1) % k)
+            sign = real(1.0)
+            if column > k:
+                sign = real(-1.0)
+            g = vec3(real(0.0), sign * e[0], sign * e[1])
+        return g
+
+    @wp.func
+    def assemble_generators(
+        lcp: LcpWorkspace, ws: ContactWorkspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, lane: int
+    ) -> int:
+        """The LCP of Anitescu and Potra in lcp.M and lcp.q; returns the number of unknowns."""
+        r = contacts.count[env]
+        if lane == 0:
+            unknowns = int(0)
+            for i in range(r):
+                ws.start[slot, i] = unknowns
+                unknowns += 1
+                if contacts.directions[env, i] < 0:
+                    unknowns += 1 - 2 * contacts.directions[env, i]
+            ws.start[slot, r] = unknowns
+        sync()
+        for ij in range(lane, r * r, wp.block_dim()):
+            i = ij // r
+            j = ij % r
+            si = ws.start[slot, i]
+            sj = ws.start[slot, j]
+            ki = -contacts.directions[env, i]
+            kj = -contacts.directions[env, j]
+            block = delassus(bodies, contacts, env, i, j)
+            if i == j:
+                block += wp.diag(contacts.relaxation[env, i])
+            for a in range(ws.start[slot, i + 1] - si):
+                left = generator(ki, a)
+                for b in range(ws.start[slot, j + 1] - sj):
+                    x = wp.dot(left, block * generator(kj, b))
+                    if i == j:
+                        if b == 2 * kj + 1 and a >= 1 and a <= 2 * ki:
+                            x = real(1.0)
+                        elif a == 2 * ki + 1 and b == 0:
+                            x = contacts.mu[env, i][0]
+                        elif a == 2 * ki + 1 and b <= 2 * kj:
+                            x = real(-1.0)
+                    lcp.M[slot, si + a, sj + b] = x
+        for i in range(lane, r, wp.block_dim()):
+            si = ws.start[slot, i]
+            for a in range(ws.start[slot, i + 1] - si):
+                lcp.q[slot, si + a] = wp.dot(generator(-contacts.directions[env, i], a), contacts.free[env, i])
+        sync()
+        return ws.start[slot, r]
+
+    @wp.func
+    def generated_impulses(lcp: LcpWorkspace, ws: ContactWorkspace, contacts: Contacts, env: int, slot: int, lane: int):
+        """h lambda of every contact from the generators' coefficients in lcp.z."""
+        for i in range(lane, contacts.count[env], wp.block_dim()):
+            p = vec3()
+            for a in range(ws.start[slot, i + 1] - ws.start[slot, i]):
+                p += lcp.z[slot, ws.start[slot, i] + a] * generator(-contacts.directions[env, i], a)
+            contacts.impulse[env, i] = p
+        sync()
+
+    return SimpleNamespace(
+        ContactWorkspace=ContactWorkspace,
+        assemble=assemble,
+        impulses=impulses,
+        assemble_generators=assemble_generators,
+        generated_impulses=generated_impulses,
+        direction=direction,
+    )
 
 
 @functools.cache
-def make(real):
-    """Kernel ``lemke_contacts``; launch tiled with dim (P): workspace P serves the environments P, P + num, ..."""
+def make(real, method: str, generators: bool = False):
+    """Kernel ``assembled_lcp`` for 'lemke', 'murty' or 'judice_pires', of eq. 39 or of Anitescu and Potra.
+
+    Launch tiled with dim (P): workspace P serves the environments P, P + num, ...
+    """
     t = scalar_types(real)
     Bodies, Contacts = t.Bodies, t.Contacts
     f = functions(real)
     ContactWorkspace, assemble, impulses = f.ContactWorkspace, f.assemble, f.impulses
-    g = lemke_file.functions(real)
-    LcpWorkspace, lemke = g.LcpWorkspace, g.lemke
+    assemble_generators, generated_impulses = f.assemble_generators, f.generated_impulses
+    LcpWorkspace = problem.functions(real).LcpWorkspace
+    solve = solver(real, method)
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
-    def lemke_contacts(
+    def assembled_lcp(
         bodies: Bodies,
         contacts: Contacts,
         unsolved: wp.array(dtype=int),
@@ -243,12 +331,19 @@ def make(real):
                 if lane == 0 and unsolved[env] != 0:
                     reason[env] = reason[env] | ITERATION_LIMIT
             elif unsolved[env] != 0 and contacts.count[env] > 0:
-                n = assemble(lcp, ws, bodies, contacts, env, slot, rho_scale, lane)
-                result = lemke(lcp, slot, n, 10 * n + 100, lane)
-                impulses(lcp, ws, contacts, env, slot, lane)
+                n = int(0)
+                if wp.static(generators):
+                    n = assemble_generators(lcp, ws, bodies, contacts, env, slot, lane)
+                else:
+                    n = assemble(lcp, ws, bodies, contacts, env, slot, rho_scale, lane)
+                result = solve(lcp, slot, n, 10 * n + 100, lane)
+                if wp.static(generators):
+                    generated_impulses(lcp, ws, contacts, env, slot, lane)
+                else:
+                    impulses(lcp, ws, contacts, env, slot, lane)
                 if lane == 0:
                     iterations[env] = iterations[env] + result[1]
                     reason[env] = reason[env] | result[0]
                 sync()
 
-    return lemke_contacts
+    return assembled_lcp

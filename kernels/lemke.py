@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lemke's method on dense LCPs  w = M z + q,  0 <= w compl. z >= 0  (Cottle and Dantzig, the paper's ref. 8).
 
-The lanes of one block share one problem: every lane takes the same decisions from the same numbers and updates its own
-columns, so a result does not depend on the number of lanes. On the CPU a block has one lane.
-
-What makes it robust (each measured to matter, docs/theory.md): equilibration, a ratio test in two passes that takes the
-largest pivot among the rows that block first (Harris), the lexicographic order where that cycles, and a final solve
-with the basis found, refactorised from the original matrix.
+What makes it robust (each measured to matter, docs/theory.md): equilibration of rows and columns, a covering vector that
+follows the size of the rows (and another where its path ends nowhere), a ratio test in two passes that takes the largest pivot
+among the rows that block first (Harris), the lexicographic order where that cycles, and a final solve with the basis found,
+refactorised from the original matrix.
 """
 
 import functools
@@ -14,50 +12,46 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import linear
-from .types import ITERATION_LIMIT, LANES, RAY, UNCERTIFIED, sync
+from . import problem
+from .problem import BETWEEN, LOWER
+from .types import ITERATION_LIMIT, RAY, sync
+
+# Covering vectors that are tried one after the other.
+COVERS = 3
 
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
-    """The workspace of a problem of at most n unknowns, and the function ``lemke`` that solves it there."""
+    """The function ``lemke`` that solves the problem in a workspace."""
     double = real is wp.float64
     pivot_tolerance = real(1.0e-11) if double else real(1.0e-5)
+    acceptable = real(1.0e-9) if double else real(1.0e-4)
     harris_slack = real(1.0e-12) if double else real(1.0e-6)
-    solve = linear.functions(real).solve
-
-    @wp.struct
-    class LcpWorkspace:
-        M: wp.array3d(dtype=real)  # [P, n, n]
-        q: wp.array2d(dtype=real)  # [P, n]
-        z: wp.array2d(dtype=real)  # [P, n] solution
-        tableau: wp.array3d(dtype=real)  # [P, n, n + 2]: x_basic = T[:, :n + 1] x_nonbasic + T[:, n + 1]
-        scale: wp.array2d(dtype=real)  # [P, n]
-        basic: wp.array2d(dtype=int)  # [P, n] variable of each row: w_i = i, z_i = n + i, z_0 = 2 n
-        nonbasic: wp.array2d(dtype=int)  # [P, n + 1] variable of each column
+    shared = problem.functions(real)
+    LcpWorkspace, equilibrate, solve_basis, violation = shared.LcpWorkspace, shared.equilibrate, shared.solve_basis, shared.violation
 
     @wp.func
     def pivot(ws: LcpWorkspace, slot: int, n: int, row: int, col: int, lane: int):
         """Exchange the basic variable of `row` with the nonbasic variable of `col`, in place."""
-        p = real(1.0) / ws.tableau[slot, row, col]
+        p = real(1.0) / ws.system[slot, row, col]
         sync()
         for j in range(lane, n + 2, wp.block_dim()):
             if j != col:
-                ws.tableau[slot, row, j] = -p * ws.tableau[slot, row, j]
+                ws.system[slot, row, j] = -p * ws.system[slot, row, j]
         sync()
         for i in range(n):
             if i != row:
-                f = ws.tableau[slot, i, col]
+                f = ws.system[slot, i, col]
                 if f != real(0.0):
                     for j in range(lane, n + 2, wp.block_dim()):
                         if j != col:
-                            ws.tableau[slot, i, j] += f * ws.tableau[slot, row, j]
+                            ws.system[slot, i, j] += f * ws.system[slot, row, j]
         sync()
         for i in range(lane, n, wp.block_dim()):
             if i != row:
-                ws.tableau[slot, i, col] = p * ws.tableau[slot, i, col]
+                ws.system[slot, i, col] = p * ws.system[slot, i, col]
         if lane == 0:
-            ws.tableau[slot, row, col] = p
+            ws.system[slot, row, col] = p
             entering = ws.nonbasic[slot, col]
             ws.nonbasic[slot, col] = ws.basic[slot, row]
             ws.basic[slot, row] = entering
@@ -66,8 +60,8 @@ def functions(real) -> SimpleNamespace:
     @wp.func
     def lexicographically_less(ws: LcpWorkspace, slot: int, n: int, a: int, b: int, col: int) -> bool:
         """Does row a leave before row b under the perturbation q + (t, t^2, ...)? Both are divided by their pivots."""
-        pa = -ws.tableau[slot, a, col]
-        pb = -ws.tableau[slot, b, col]
+        pa = -ws.system[slot, a, col]
+        pb = -ws.system[slot, b, col]
         for k in range(n):
             ka = real(0.0)
             kb = real(0.0)
@@ -78,8 +72,8 @@ def functions(real) -> SimpleNamespace:
             else:
                 for j in range(n + 1):
                     if ws.nonbasic[slot, j] == k:
-                        ka = -ws.tableau[slot, a, j]
-                        kb = -ws.tableau[slot, b, j]
+                        ka = -ws.system[slot, a, j]
+                        kb = -ws.system[slot, b, j]
             difference = ka * pb - kb * pa
             if wp.abs(difference) > pivot_tolerance * (wp.abs(ka * pb) + wp.abs(kb * pa)):
                 return difference < real(0.0)
@@ -90,18 +84,18 @@ def functions(real) -> SimpleNamespace:
         """Row that blocks the entering variable first, or -1 (a ray). z_0 leaves as soon as it can."""
         largest = real(0.0)
         for i in range(n):
-            largest = wp.max(largest, wp.abs(ws.tableau[slot, i, col]))
+            largest = wp.max(largest, wp.abs(ws.system[slot, i, col]))
         tolerance = pivot_tolerance * wp.max(largest, real(1.0))
         bound = real(1.0e30)
         for i in range(n):
-            p = -ws.tableau[slot, i, col]
+            p = -ws.system[slot, i, col]
             if p > tolerance:
-                bound = wp.min(bound, (wp.max(ws.tableau[slot, i, n + 1], real(0.0)) + slack) / p)
+                bound = wp.min(bound, (wp.max(ws.system[slot, i, n + 1], real(0.0)) + slack) / p)
         best = int(-1)
         best_pivot = real(0.0)
         for i in range(n):
-            p = -ws.tableau[slot, i, col]
-            if p > tolerance and ws.tableau[slot, i, n + 1] <= bound * p:
+            p = -ws.system[slot, i, col]
+            if p > tolerance and ws.system[slot, i, n + 1] <= bound * p:
                 if ws.basic[slot, i] == 2 * n:
                     return i
                 if best < 0:
@@ -116,69 +110,46 @@ def functions(real) -> SimpleNamespace:
         return best
 
     @wp.func
-    def load(ws: LcpWorkspace, slot: int, n: int, lane: int):
-        """Equilibrated tableau of the start basis w."""
+    def load(ws: LcpWorkspace, slot: int, n: int, cover: int, lane: int):
+        """Equilibrated tableau of the start basis w: x_basic = T[:, :n + 1] x_nonbasic + T[:, n + 1].
+
+        The covering vector, column n, is the sum of sizes of each row (0), or ones (1), or numbers from 1 to 2 (2).
+        """
         for i in range(lane, n, wp.block_dim()):
-            size = wp.abs(ws.M[slot, i, i])
-            if size == real(0.0):
-                for j in range(n):
-                    size = wp.max(size, wp.max(wp.abs(ws.M[slot, i, j]), wp.abs(ws.M[slot, j, i])))
-            ws.scale[slot, i] = real(1.0)
-            if size > real(0.0):
-                ws.scale[slot, i] = real(1.0) / wp.sqrt(size)
+            total = real(0.0)
+            for j in range(n):
+                entry = ws.row_scale[slot, i] * ws.M[slot, i, j] * ws.column_scale[slot, j]
+                ws.system[slot, i, j] = entry
+                total += wp.abs(entry)
+            if cover == 1 or total == real(0.0):
+                total = real(1.0)
+            elif cover == 2:
+                total = real(1.0) + real(i) / real(n)
+            ws.system[slot, i, n] = total
+            ws.system[slot, i, n + 1] = ws.row_scale[slot, i] * ws.q[slot, i]
             ws.basic[slot, i] = i
             ws.nonbasic[slot, i] = n + i
         if lane == 0:
             ws.nonbasic[slot, n] = 2 * n
         sync()
-        for i in range(n):
-            for j in range(lane, n, wp.block_dim()):
-                ws.tableau[slot, i, j] = ws.scale[slot, i] * ws.M[slot, i, j] * ws.scale[slot, j]
-            if lane == 0:
-                ws.tableau[slot, i, n] = real(1.0)
-                ws.tableau[slot, i, n + 1] = ws.scale[slot, i] * ws.q[slot, i]
-        sync()
 
     @wp.func
-    def solve_basis(ws: LcpWorkspace, slot: int, n: int, lane: int) -> bool:
-        """z of the basis found, from the original numbers: M_aa z_a = -q_a by Gaussian elimination with row pivoting.
-
-        Works in the tableau's memory. Returns False (and leaves z alone) where the basis is singular.
-        """
-        # The rows and columns that take part, in the order of the unknowns; nonbasic[:m] becomes the list.
-        m = int(0)
-        if lane == 0:
-            for i in range(n):
-                ws.nonbasic[slot, i] = -1
-            for r in range(n):
-                b = ws.basic[slot, r]
-                if b >= n and b < 2 * n:
-                    ws.nonbasic[slot, b - n] = 0
-            for i in range(n):
-                if ws.nonbasic[slot, i] == 0:
-                    ws.nonbasic[slot, m] = i
-                    m += 1
-            ws.nonbasic[slot, n] = m
-        sync()
-        m = ws.nonbasic[slot, n]
-        for i in range(m):
-            a = ws.nonbasic[slot, i]
-            for j in range(lane, m, wp.block_dim()):
-                b = ws.nonbasic[slot, j]
-                ws.tableau[slot, i, j] = ws.scale[slot, a] * ws.M[slot, a, b] * ws.scale[slot, b]
-            if lane == 0:
-                ws.tableau[slot, i, m] = -ws.scale[slot, a] * ws.q[slot, a]
-        sync()
-        if not solve(ws.tableau, slot, m, lane):
-            return False
+    def refactorise(ws: LcpWorkspace, slot: int, n: int, lane: int) -> bool:
+        """z of the basis found, from the original numbers; False where the basis is singular. Overwrites the tableau."""
         for i in range(lane, n, wp.block_dim()):
-            ws.z[slot, i] = real(0.0)
+            ws.state[slot, i] = LOWER
         sync()
-        for i in range(lane, m, wp.block_dim()):
-            a = ws.nonbasic[slot, i]
-            ws.z[slot, a] = wp.max(ws.tableau[slot, i, m], real(0.0)) * ws.scale[slot, a]
+        for r in range(lane, n, wp.block_dim()):
+            b = ws.basic[slot, r]
+            if b >= n and b < 2 * n:
+                ws.state[slot, b - n] = BETWEEN
         sync()
-        return True
+        regular = solve_basis(ws, slot, n, real(0.0), real(0.0), lane) == 0
+        for i in range(lane, n, wp.block_dim()):
+            # A singular basis: its tableau is gone, and what stands in z belongs to another problem.
+            ws.z[slot, i] = wp.where(regular, wp.max(ws.x[slot, i], real(0.0)), real(0.0))
+        sync()
+        return regular
 
     @wp.func
     def read_tableau(ws: LcpWorkspace, slot: int, n: int, lane: int):
@@ -189,23 +160,24 @@ def functions(real) -> SimpleNamespace:
         for r in range(lane, n, wp.block_dim()):
             b = ws.basic[slot, r]
             if b >= n and b < 2 * n:
-                ws.z[slot, b - n] = wp.max(ws.tableau[slot, r, n + 1], real(0.0)) * ws.scale[slot, b - n]
+                ws.z[slot, b - n] = wp.max(ws.system[slot, r, n + 1], real(0.0)) * ws.column_scale[slot, b - n]
         sync()
 
     @wp.func
-    def lemke(ws: LcpWorkspace, slot: int, n: int, limit: int, lane: int) -> wp.vec2i:
-        """Solve the problem in ws.M, ws.q of a slot into ws.z; returns (status bits, pivots)."""
-        load(ws, slot, n, lane)
+    def follow(ws: LcpWorkspace, slot: int, n: int, cover: int, limit: int, lane: int) -> wp.vec2i:
+        """Follow the path of one covering vector to its end, z to ws.z; returns (status bits, pivots)."""
+        load(ws, slot, n, cover, lane)
         row = int(0)
         size = real(0.0)
         for i in range(n):
-            size = wp.max(size, wp.abs(ws.tableau[slot, i, n + 1]))
-            if ws.tableau[slot, i, n + 1] < ws.tableau[slot, row, n + 1]:
+            size = wp.max(size, wp.abs(ws.system[slot, i, n + 1]))
+            # q_i / d_i least, multiplied out
+            if ws.system[slot, i, n + 1] * ws.system[slot, row, n] < ws.system[slot, row, n + 1] * ws.system[slot, i, n]:
                 row = i
         status = int(0)
         pivots = int(0)
-        if n > 0 and ws.tableau[slot, row, n + 1] < real(0.0):
-            # z_0 enters, the most negative row leaves, then the complement of what left enters, until z_0 leaves.
+        if n > 0 and ws.system[slot, row, n + 1] < real(0.0):
+            # z_0 enters, the row that needs most of it leaves, then the complement of what left enters, until z_0 leaves.
             col = int(n)
             searching = bool(True)
             while searching:
@@ -228,61 +200,25 @@ def functions(real) -> SimpleNamespace:
                         searching = False
         if status != 0:
             read_tableau(ws, slot, n, lane)
-        elif not solve_basis(ws, slot, n, lane):
-            # A singular basis: its tableau is gone, and what stands in z belongs to another problem.
-            for i in range(lane, n, wp.block_dim()):
-                ws.z[slot, i] = real(0.0)
-            sync()
+        elif not refactorise(ws, slot, n, lane):
             status = RAY
         return wp.vec2i(status, pivots)
 
-    return SimpleNamespace(LcpWorkspace=LcpWorkspace, lemke=lemke)
-
-
-@functools.cache
-def make(real):
-    """Kernel ``solve_batch`` for problems given as arrays; launch tiled with dim (P), P <= B workspaces."""
-    f = functions(real)
-    LcpWorkspace, lemke = f.LcpWorkspace, f.lemke
-
-    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
-    def solve_batch(
-        M: wp.array3d(dtype=real),
-        q: wp.array2d(dtype=real),
-        limit: int,
-        tolerance: real,
-        ws: LcpWorkspace,
-        z: wp.array2d(dtype=real),
-        w: wp.array2d(dtype=real),
-        residual: wp.array(dtype=real),
-        iterations: wp.array(dtype=int),
-        status: wp.array(dtype=int),
-    ):
-        slot, lane = wp.tid()
-        n = q.shape[1]
-        for problem in range(slot, q.shape[0], ws.q.shape[0]):
-            for i in range(lane, n, wp.block_dim()):
-                for j in range(n):
-                    ws.M[slot, i, j] = M[problem, i, j]
-                ws.q[slot, i] = q[problem, i]
+    @wp.func
+    def lemke(ws: LcpWorkspace, slot: int, n: int, limit: int, lane: int) -> wp.vec2i:
+        """Solve the plain LCP in ws.M, ws.q into ws.z; returns (status bits, pivots)."""
+        equilibrate(ws, slot, n, lane)
+        status = int(0)
+        pivots = int(0)
+        cover = int(0)
+        while cover < COVERS:
+            result = follow(ws, slot, n, cover, limit, lane)
+            status = result[0]
+            pivots += result[1]
+            cover += 1
+            if status == 0 and violation(ws, slot, n, lane) <= acceptable:
+                cover = COVERS
             sync()
-            result = lemke(ws, slot, n, limit, lane)
-            for i in range(lane, n, wp.block_dim()):
-                x = q[problem, i]
-                for j in range(n):
-                    x += M[problem, i, j] * ws.z[slot, j]
-                w[problem, i] = x
-                z[problem, i] = ws.z[slot, i]
-            sync()
-            if lane == 0:
-                worst = real(0.0)
-                for i in range(n):
-                    worst = wp.max(worst, wp.abs(wp.min(z[problem, i], w[problem, i])))
-                residual[problem] = worst
-                iterations[problem] = result[1]
-                status[problem] = result[0]
-                if not worst <= tolerance:
-                    status[problem] = result[0] | UNCERTIFIED
-            sync()
+        return wp.vec2i(status, pivots)
 
-    return solve_batch
+    return SimpleNamespace(lemke=lemke)

@@ -14,7 +14,7 @@ from .types import sync
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
-    """``invert`` for symmetric positive definite matrices and ``solve`` for general ones."""
+    """``invert`` for symmetric positive definite matrices, ``solve`` and ``solve_deficient`` for general ones."""
 
     @wp.func
     def invert(a: wp.array3d(dtype=real), slot: int, n: int, lane: int):
@@ -41,24 +41,35 @@ def functions(real) -> SimpleNamespace:
             sync()
 
     @wp.func
-    def solve(a: wp.array3d(dtype=real), slot: int, n: int, lane: int) -> bool:
-        """Solve A x = b, given [A b] in a[slot, :n, :n + 1], by Gaussian elimination with row pivoting.
+    def solve_deficient(a: wp.array3d(dtype=real), slot: int, n: int, tiny: real, substitute: real, lane: int) -> int:
+        """Solve A x = b, given [A b] in a[slot, :n, :n + 1], by Gaussian elimination with row pivoting; A may be singular.
 
-        x replaces b. Returns False where A is singular.
+        x replaces b. A pivot of no more than `tiny` is replaced by one of size `substitute`; where that is zero, its
+        unknown is set to zero instead and one equation is left out. Returns how many such pivots there were; the
+        diagonal of a is 0 for unknowns that were set to zero and 1 for all others.
         """
+        deficient = int(0)
         for k in range(n):
             r = int(k)
             for i in range(k + 1, n):
                 if wp.abs(a[slot, i, k]) > wp.abs(a[slot, r, k]):
                     r = i
             p = a[slot, r, k]
-            if p == real(0.0):
-                return False
+            keep = real(1.0)
+            if wp.abs(p) <= tiny:
+                deficient += 1
+                if substitute > real(0.0):
+                    p = wp.where(p < real(0.0), -substitute, substitute)
+                else:
+                    p = real(1.0)
+                    keep = real(0.0)
             sync()
             for j in range(k + lane, n + 1, wp.block_dim()):
                 x = a[slot, r, j]
                 a[slot, r, j] = a[slot, k, j]
-                a[slot, k, j] = x / p
+                a[slot, k, j] = keep * (x / p)
+            if lane == 0:
+                a[slot, k, k] = keep  # 0 / 1, also where the pivot was replaced
             sync()
             for i in range(k + 1, n):
                 f = a[slot, i, k]
@@ -72,8 +83,13 @@ def functions(real) -> SimpleNamespace:
                 x = a[slot, k, n]
                 for j in range(k + 1, n):
                     x -= a[slot, k, j] * a[slot, j, n]
-                a[slot, k, n] = x
+                a[slot, k, n] = x * a[slot, k, k]
         sync()
-        return True
+        return deficient
 
-    return SimpleNamespace(invert=invert, solve=solve)
+    @wp.func
+    def solve(a: wp.array3d(dtype=real), slot: int, n: int, lane: int) -> bool:
+        """Solve A x = b as above; returns False where A is singular."""
+        return solve_deficient(a, slot, n, real(0.0), real(0.0), lane) == 0
+
+    return SimpleNamespace(invert=invert, solve=solve, solve_deficient=solve_deficient)

@@ -23,7 +23,7 @@ def make(real):
     law = friction.functions(real)
     project_friction, weigh = law.project_friction, law.weigh
     f = rigid.functions(real)
-    point_velocity, impulse_response = f.point_velocity, f.impulse_response
+    point_velocity, wrench, response = f.point_velocity, f.wrench, f.response
 
     @wp.func
     def relative(
@@ -87,7 +87,7 @@ def make(real):
                         if b >= 0:
                             arm = point - bodies.com[env, b]
                             sign = real(2 * side - 1)
-                            velocity[env, b] += impulse_response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * push)
+                            velocity[env, b] += response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], wrench(arm, sign * push))
                     if k != 0:
                         relaxed = free + frame * relative(velocity, bodies.free_velocity, bodies.com, env, body, point) + wp.cw_mul(eps, p)
                         x = vec2(p[1] - relaxed[1] / diagonal[1], p[2] - relaxed[2] / diagonal[2])
@@ -99,7 +99,7 @@ def make(real):
                             if b >= 0:
                                 arm = point - bodies.com[env, b]
                                 sign = real(2 * side - 1)
-                                velocity[env, b] += impulse_response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, sign * push)
+                                velocity[env, b] += response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], wrench(arm, sign * push))
                     contacts.impulse[env, i] = p
                     change = wp.max(change, wp.max(wp.abs(wp.cw_mul(diagonal, p - old))))
                 sweep += 1

@@ -9,6 +9,10 @@ and f = J v_free + d,
 
     (M + sum (J_n + s mu J_j)^T J_n / eps_n + sum J_j^T J_j / eps_j) x = -sum (J_n + s mu J_j)^T f_n / eps_n - sum J_j^T f_j / eps_j.
 
+In world axes a contact's impulse is p = -(K J x + g) with a 3 x 3 matrix K, so that it adds blocks K, -K [r], [r] K, -[r] K [r] to
+its bodies' part of the system. One body: 6 unknowns in registers. Several: block-sparse, bodies that share a contact being
+neighbours (kernels/sparse.py).
+
 States whose sign conditions fail are flipped, all at once, until none does. Started from the states that the contact
 rows expect (loaded or not, sliding or sticking) that takes one to three solves. It may cycle: then the environment
 stays unsolved and a safer method takes over.
@@ -28,8 +32,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import linear
-from .types import DISC, LANES, scalar_types, sync
+from . import sparse
+from .types import LANES, scalar_types, sync
 
 # State of a contact while it is solved: bit 0 closed, bits 1-2 axis t1, bits 3-4 axis t2.
 CLOSED = wp.constant(1)
@@ -41,14 +45,14 @@ CONE_TOLERANCE = wp.constant(1.0e-9)
 
 
 @functools.cache
-def functions(real) -> SimpleNamespace:
-    """Functions of one contact, whatever solves the linear system.
+def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
+    """Functions of one contact, whatever solves the linear system: ``operator`` and ``update``.
 
-    They take numbers, not bundles: Warp passes a bundle by value, a kilobyte a call.
+    cone: Coulomb's cone instead of two axes; frozen: limits that do not follow p_n. They take numbers, not bundles: Warp passes
+    a bundle by value, a kilobyte a call.
     """
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
-    vec6 = wp.types.vector(length=6, dtype=real)
 
     @wp.func
     def axis_state(state: int, axis: int) -> int:
@@ -97,7 +101,10 @@ def functions(real) -> SimpleNamespace:
     @wp.func
     def has_friction(state: int, bound: vec2, k: int) -> bool:
         """Do the axes of a contact take part? Those of an open one only with a limit of their own."""
-        return k != 0 and ((state & CLOSED) != 0 or bound[0] + bound[1] > real(0.0))
+        result = k != 0 and (state & CLOSED) != 0
+        if wp.static(frozen):
+            result = k != 0 and ((state & CLOSED) != 0 or bound[0] + bound[1] > real(0.0))
+        return result
 
     @wp.func
     def next_state(relaxed: vec3, eps: vec3, w_nn: real, mu: vec2, bound: vec2, k: int, state: int, tolerance: real) -> int:
@@ -154,7 +161,7 @@ def functions(real) -> SimpleNamespace:
         return result, after, turned or result != state
 
     @wp.func
-    def cone_impulse(relaxed: vec3, eps: vec3, mu: real, state: int, slip: vec3) -> vec3:
+    def cone_impulse(relaxed: vec3, eps: vec3, mu: real, state: int) -> vec3:
         """Impulse of a contact on the cone, as the linear system of its state saw it."""
         p = vec3()
         if (state & CLOSED) != 0:
@@ -170,44 +177,103 @@ def functions(real) -> SimpleNamespace:
         return p
 
     @wp.func
-    def turned_frame(frame: mat33, slip: vec3) -> mat33:
-        """Rows n, the slip, across it."""
-        t1 = slip[0] * frame[1] + slip[1] * frame[2]
-        return wp.matrix_from_rows(frame[0], t1, wp.cross(frame[0], t1))
+    def operator(frame: mat33, eps: vec3, free: vec3, mu: vec2, bound: vec2, k: int, state: int, slip: vec3):
+        """K [kg] and g [N s], world axes, of a contact in its state: p = -(K J x + g)."""
+        n = frame[0]
+        matrix = mat33()
+        shift = vec3()
+        column = n
+        t1 = frame[1]
+        t2 = frame[2]
+        f1 = free[1]
+        f2 = free[2]
+        e2 = eps[2]
+        if wp.static(cone):  # noqa: SIM102
+            if axis_state(state, 0) != AXIS_STICKS:  # axes along and across the slip
+                t1 = slip[0] * frame[1] + slip[1] * frame[2]
+                t2 = wp.cross(n, t1)
+                f1 = slip[0] * free[1] + slip[1] * free[2]
+                f2 = slip[0] * free[2] - slip[1] * free[1]
+                e2 = slip[2]
+        if has_friction(state, bound, k):
+            if axis_state(state, 0) == AXIS_STICKS:
+                scaled = t1 / eps[1]
+                matrix += wp.outer(scaled, t1)
+                shift += scaled * f1
+            else:
+                sign = real(1.0)
+                if axis_state(state, 0) == AXIS_SLIDES_UP:
+                    sign = real(-1.0)
+                column += (sign * mu[0]) * t1
+                if wp.static(frozen):
+                    shift -= (sign * bound[0]) * t1
+            if axis_state(state, 1) == AXIS_STICKS:
+                scaled = t2 / e2
+                matrix += wp.outer(scaled, t2)
+                shift += scaled * f2
+            else:
+                sign = real(1.0)
+                if axis_state(state, 1) == AXIS_SLIDES_UP:
+                    sign = real(-1.0)
+                column += (sign * mu[1]) * t2
+                if wp.static(frozen):
+                    shift -= (sign * bound[1]) * t2
+        if (state & CLOSED) != 0:
+            column = column / eps[0]
+            matrix += wp.outer(column, n)
+            shift += column * free[0]
+        return matrix, shift
 
     @wp.func
-    def row(direction: vec3, arm: vec3, sign: real) -> vec6:
-        """J of one direction of a contact and one of its bodies: sign (d, r x d)."""
-        m = wp.cross(arm, direction)
-        return vec6(sign * direction[0], sign * direction[1], sign * direction[2], sign * m[0], sign * m[1], sign * m[2])
+    def update(relaxed: vec3, eps: vec3, w: vec3, mu: vec2, bound: vec2, k: int, state: int, slip: vec3, tolerance: real):
+        """Impulse (n, t1, t2) of a contact in its state, the state and slip that its signs ask for, and whether they are others.
 
-    return SimpleNamespace(
-        axis_state=axis_state,
-        has_friction=has_friction,
-        next_state=next_state,
-        state_impulse=state_impulse,
-        next_cone=next_cone,
-        cone_impulse=cone_impulse,
-        turned_frame=turned_frame,
-        row=row,
-    )
+        relaxed = f + J x; w: diagonal of J M^-1 J^T.
+        """
+        p = vec3()
+        after = int(0)
+        turned = slip
+        again = bool(False)
+        if wp.static(cone):
+            p = cone_impulse(relaxed, eps, mu[0], state)
+            if k != 0:
+                after, turned, again = next_cone(relaxed, eps, w, mu[0], state, slip, tolerance)
+            else:
+                after = next_closed(relaxed[0], eps[0], w[0], state, tolerance)
+                again = after != state
+        else:
+            p = state_impulse(relaxed, eps, mu, bound, k, state)
+            after = next_state(relaxed, eps, w[0], mu, bound, k, state, tolerance)
+            again = after != state
+        return p, after, turned, again
+
+    return SimpleNamespace(has_friction=has_friction, operator=operator, update=update)
 
 
 @functools.cache
-def make_single(real):
+def make_single(real, cone: bool, frozen: bool):
     """Kernel ``pivot_single`` for scenes with one movable body: a thread an environment, 6 x 6 in registers; dim (E)."""
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     vec6 = wp.types.vector(length=6, dtype=real)
     mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
     Bodies, Contacts = t.Bodies, t.Contacts
-    f = functions(real)
-    axis_state, has_friction, next_state, state_impulse = f.axis_state, f.has_friction, f.next_state, f.state_impulse
-    next_cone, cone_impulse, turned_frame, row = f.next_cone, f.cone_impulse, f.turned_frame, f.row
+    f = functions(real, cone, frozen)
+    has_friction, operator, update = f.has_friction, f.operator, f.update
 
     @wp.func
-    def solve(a: mat66, b: vec6) -> vec6:
+    def solve(vv: mat33, vw: mat33, wv: mat33, ww: mat33, bv: vec3, bw: vec3) -> vec6:
         """Gaussian elimination; the certificate judges the answer, so no pivot search."""
+        a = mat66()
+        b = vec6()
+        for i in range(3):
+            b[i] = bv[i]
+            b[3 + i] = bw[i]
+            for j in range(3):
+                a[i, j] = vv[i, j]
+                a[i, 3 + j] = vw[i, j]
+                a[3 + i, j] = wv[i, j]
+                a[3 + i, 3 + j] = ww[i, j]
         p = vec6()
         for k in range(6):
             p[k] = real(1.0) / a[k, k]
@@ -223,33 +289,6 @@ def make_single(real):
                 x -= a[k, j] * b[j]
             b[k] = x * p[k]
         return b
-
-    @wp.func
-    def add_contact(
-        a: mat66, b: vec6, frame: mat33, arm: vec3, sign: real, eps: vec3, free: vec3, mu: vec2, bound: vec2, k: int, state: int
-    ):
-        """Add what a contact contributes in its state."""
-        j_n = row(frame[0], arm, sign)
-        column = j_n
-        if has_friction(state, bound, k):
-            for axis in range(2):
-                j_t = row(frame[axis + 1], arm, sign)
-                s = axis_state(state, axis)
-                if s == AXIS_STICKS:
-                    scaled = (real(1.0) / eps[axis + 1]) * j_t
-                    a += wp.outer(scaled, j_t)
-                    b -= scaled * free[axis + 1]
-                elif s == AXIS_SLIDES_UP:
-                    column -= mu[axis] * j_t
-                    b -= bound[axis] * j_t
-                else:
-                    column += mu[axis] * j_t
-                    b += bound[axis] * j_t
-        if (state & CLOSED) != 0:
-            column = (real(1.0) / eps[0]) * column
-            a += wp.outer(column, j_n)
-            b -= column * free[0]
-        return a, b
 
     @wp.kernel(module="unique", enable_backward=False)
     def pivot_single(
@@ -268,41 +307,48 @@ def make_single(real):
                 continue
             com = bodies.com[env, body]
             inertia = wp.inverse(bodies.inv_inertia[env, body])
-            m = real(1.0) / bodies.inv_mass[env, body]
-            x = vec6()
+            mass = wp.diag(vec3(real(1.0) / bodies.inv_mass[env, body]))
             flips = int(1)
             solves = int(0)
-            for i in range(r):
-                if contacts.directions[env, i] > 2 or contacts.directions[env, i] < 0:
-                    flips = 0
             while flips > 0 and solves < limit:
-                a = mat66(
-                    m, real(0.0), real(0.0), real(0.0), real(0.0), real(0.0),
-                    real(0.0), m, real(0.0), real(0.0), real(0.0), real(0.0),
-                    real(0.0), real(0.0), m, real(0.0), real(0.0), real(0.0),
-                    real(0.0), real(0.0), real(0.0), inertia[0, 0], inertia[0, 1], inertia[0, 2],
-                    real(0.0), real(0.0), real(0.0), inertia[1, 0], inertia[1, 1], inertia[1, 2],
-                    real(0.0), real(0.0), real(0.0), inertia[2, 0], inertia[2, 1], inertia[2, 2],
-                )  # fmt: skip
-                b = vec6()
+                vv = mass
+                vw = mat33()
+                wv = mat33()
+                ww = inertia
+                bv = vec3()
+                bw = vec3()
                 for i in range(r):
                     state = contacts.state[env, i]
-                    bound = contacts.bound[env, i]
                     k = contacts.directions[env, i]
+                    bound = vec2()
+                    if wp.static(frozen):
+                        bound = contacts.bound[env, i]
                     if (state & CLOSED) != 0 or has_friction(state, bound, k):
-                        sign = real(1.0)
-                        if contacts.body[env, i][0] == body:
-                            sign = real(-1.0)
-                        frame = contacts.frame[env, i]
-                        free = contacts.free[env, i]
-                        eps = contacts.relaxation[env, i]
-                        if k == DISC and axis_state(state, 0) != AXIS_STICKS:
+                        slip = vec3()
+                        if wp.static(cone):
                             slip = contacts.slip[env, i]
-                            free = turned_frame(frame, slip) * (wp.transpose(frame) * free)
-                            frame = turned_frame(frame, slip)
-                            eps[2] = slip[2]
-                        a, b = add_contact(a, b, frame, contacts.point[env, i] - com, sign, eps, free, contacts.mu[env, i], bound, k, state)
-                x = solve(a, b)
+                        matrix, shift = operator(
+                            contacts.frame[env, i],
+                            contacts.relaxation[env, i],
+                            contacts.free[env, i],
+                            contacts.mu[env, i],
+                            bound,
+                            k,
+                            state,
+                            slip,
+                        )
+                        if contacts.body[env, i][0] == body:
+                            shift = -shift
+                        arm = contacts.point[env, i] - com
+                        turn = wp.skew(arm)
+                        right = matrix * turn
+                        vv += matrix
+                        vw -= right
+                        wv += turn * matrix
+                        ww -= turn * right
+                        bv -= shift
+                        bw -= wp.cross(arm, shift)
+                x = solve(vv, vw, wv, ww, bv, bw)
                 solves += 1
                 flips = int(0)
                 dv = vec3(x[0], x[1], x[2])
@@ -312,212 +358,278 @@ def make_single(real):
                     if contacts.body[env, i][0] == body:
                         du = -du
                     relaxed = contacts.free[env, i] + contacts.frame[env, i] * du
-                    eps = contacts.relaxation[env, i]
-                    mu = contacts.mu[env, i]
-                    k = contacts.directions[env, i]
-                    state = contacts.state[env, i]
-                    w = contacts.inv_mass[env, i]
-                    if k == DISC:
-                        slip = contacts.slip[env, i]
-                        contacts.impulse[env, i] = cone_impulse(relaxed, eps, mu[0], state, slip)
-                        after, turned, again = next_cone(relaxed, eps, w, mu[0], state, slip, tolerance)
-                        contacts.slip[env, i] = turned
-                        contacts.state[env, i] = after
-                        if again:
-                            flips += 1
-                    else:
+                    bound = vec2()
+                    if wp.static(frozen):
                         bound = contacts.bound[env, i]
-                        after = next_state(relaxed, eps, w[0], mu, bound, k, state, tolerance)
-                        contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, bound, k, state)
-                        if after != state:
-                            flips += 1
-                            contacts.state[env, i] = after
+                    slip = vec3()
+                    if wp.static(cone):
+                        slip = contacts.slip[env, i]
+                    p, after, turned, again = update(
+                        relaxed,
+                        contacts.relaxation[env, i],
+                        contacts.inv_mass[env, i],
+                        contacts.mu[env, i],
+                        bound,
+                        contacts.directions[env, i],
+                        contacts.state[env, i],
+                        slip,
+                        tolerance,
+                    )
+                    contacts.impulse[env, i] = p
+                    if again:
+                        flips += 1
+                        contacts.state[env, i] = after
+                        if wp.static(cone):
+                            contacts.slip[env, i] = turned
             iterations[env] = iterations[env] + solves
 
     return pivot_single
 
 
 @functools.cache
-def make(real) -> SimpleNamespace:
+def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
     """Bundle ``Workspace`` and kernel ``pivot`` for scenes with several movable bodies; launch tiled with dim (P)."""
     t = scalar_types(real)
-    vec3 = t.vec3
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     vec6 = wp.types.vector(length=6, dtype=real)
+    mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
     Bodies, Contacts = t.Bodies, t.Contacts
-    f = functions(real)
-    axis_state, has_friction, next_state, state_impulse = f.axis_state, f.has_friction, f.next_state, f.state_impulse
-    next_cone, cone_impulse, turned_frame, row = f.next_cone, f.cone_impulse, f.turned_frame, f.row
-    solve = linear.functions(real).solve
+    f = functions(real, cone, frozen)
+    operator, update = f.operator, f.update
+    s = sparse.functions(real, 6)
+    Graph, clear, connect, analyse, clear_factors = s.Graph, s.clear, s.connect, s.analyse, s.clear_factors
+    factorise, solve = s.factorise, s.solve
 
     @wp.struct
     class Workspace:
-        system: wp.array3d(dtype=real)  # [P, nv, nv + 1]
-        start: wp.array(dtype=int)  # [B] first of a body's six unknowns, -1 = does not answer to forces
+        """Systems of the movable bodies of P environments."""
+
+        number: wp.array(dtype=int)  # [B] of a body among those that answer to forces, -1 = it does not
+        body: wp.array(dtype=int)  # [n] its inverse
+        begin: wp.array2d(dtype=int)  # [P, n + 1] first contact of each movable body in `contact`
+        contact: wp.array2d(dtype=int)  # [P, 2 R]
+        matrix: wp.array2d(dtype=mat33)  # [P, R] K
+        shift: wp.array2d(dtype=vec3)  # [P, R] g
+        change: wp.array2d(dtype=vec6)  # [P, n] x
+        scratch: wp.array2d(dtype=vec6)  # [P, n]
         flips: wp.array(dtype=int)  # [P]
 
     @wp.func
-    def start_of(ws: Workspace, body: int) -> int:
-        start = int(-1)
+    def node(number: wp.array(dtype=int), body: int) -> int:
+        result = int(-1)
         if body >= 0:
-            start = ws.start[body]
-        return start
+            result = number[body]
+        return result
 
     @wp.func
-    def load_masses(ws: Workspace, bodies: Bodies, env: int, slot: int, lane: int):
-        n = ws.system.shape[1]
-        for k in range(lane, n * (n + 1), wp.block_dim()):
-            ws.system[slot, k // (n + 1), k % (n + 1)] = real(0.0)
-        sync()
-        for b in range(lane, ws.start.shape[0], wp.block_dim()):
-            i = ws.start[b]
-            if i >= 0:
-                inertia = wp.inverse(bodies.inv_inertia[env, b])
-                for x in range(3):
-                    ws.system[slot, i + x, i + x] = real(1.0) / bodies.inv_mass[env, b]
-                    for y in range(3):
-                        ws.system[slot, i + 3 + x, i + 3 + y] = inertia[x, y]
-        sync()
-
-    @wp.func
-    def add_term(ws: Workspace, slot: int, start: wp.vec2i, column_a: vec6, column_b: vec6, row_a: vec6, row_b: vec6, f: real, lane: int):
-        """System += [column] [row], right-hand side -= [column] f; the two sides of a contact one below the other."""
-        n = ws.system.shape[1]
-        for k in range(lane, 12, wp.block_dim()):
-            i = start[0]
-            c = column_a[k % 6]
-            if k >= 6:
-                i = start[1]
-                c = column_b[k % 6]
-            if i >= 0:
-                for j in range(6):
-                    if start[0] >= 0:
-                        ws.system[slot, i + k % 6, start[0] + j] += c * row_a[j]
-                    if start[1] >= 0:
-                        ws.system[slot, i + k % 6, start[1] + j] += c * row_b[j]
-                ws.system[slot, i + k % 6, n] -= c * f
+    def list_contacts(ws: Workspace, body: wp.array2d(dtype=wp.vec2i), env: int, slot: int, r: int, lane: int):
+        """Contacts of each movable body, in order."""
+        if lane == 0:
+            n = ws.body.shape[0]
+            for b in range(n + 1):
+                ws.begin[slot, b] = 0
+            for i in range(r):
+                for side in range(2):
+                    b = node(ws.number, body[env, i][side])
+                    if b >= 0:
+                        ws.begin[slot, b + 1] = ws.begin[slot, b + 1] + 1
+            for b in range(n):
+                ws.begin[slot, b + 1] = ws.begin[slot, b + 1] + ws.begin[slot, b]
+            for ii in range(r):
+                i = r - 1 - ii
+                for side in range(2):
+                    b = node(ws.number, body[env, i][side])
+                    if b >= 0:
+                        last = ws.begin[slot, b + 1] - 1
+                        ws.begin[slot, b + 1] = last
+                        ws.contact[slot, last] = i
+            # begin[b + 1] has come down to where body b begins
+            for b in range(n):
+                ws.begin[slot, b] = ws.begin[slot, b + 1]
+            total = int(0)
+            for i in range(r):
+                for side in range(2):
+                    if node(ws.number, body[env, i][side]) >= 0:
+                        total += 1
+            ws.begin[slot, n] = total
         sync()
 
     @wp.func
-    def add_contact(ws: Workspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, i: int, lane: int):
-        """Add what a contact contributes in its present state."""
-        body = contacts.body[env, i]
-        start = wp.vec2i(start_of(ws, body[0]), start_of(ws, body[1]))
-        arm_a = vec3()
-        arm_b = vec3()
-        if start[0] >= 0:
-            arm_a = contacts.point[env, i] - bodies.com[env, body[0]]
-        if start[1] >= 0:
-            arm_b = contacts.point[env, i] - bodies.com[env, body[1]]
-        frame = contacts.frame[env, i]
-        eps = contacts.relaxation[env, i]
-        free = contacts.free[env, i]
-        state = contacts.state[env, i]
-        bound = contacts.bound[env, i]
-        k = contacts.directions[env, i]
-        if k == DISC and axis_state(state, 0) != AXIS_STICKS:
-            slip = contacts.slip[env, i]
-            free = turned_frame(frame, slip) * (wp.transpose(frame) * free)
-            frame = turned_frame(frame, slip)
-            eps[2] = slip[2]
-        n_a = row(frame[0], arm_a, real(-1.0))
-        n_b = row(frame[0], arm_b, real(1.0))
-        column_a = n_a
-        column_b = n_b
-        if has_friction(state, bound, k):
-            for axis in range(2):
-                t_a = row(frame[axis + 1], arm_a, real(-1.0))
-                t_b = row(frame[axis + 1], arm_b, real(1.0))
-                s = axis_state(state, axis)
-                mu = contacts.mu[env, i][axis]
-                if s == AXIS_STICKS:
-                    add_term(ws, slot, start, t_a / eps[axis + 1], t_b / eps[axis + 1], t_a, t_b, free[axis + 1], lane)
-                else:
-                    sign = real(1.0)
-                    if s == AXIS_SLIDES_UP:
-                        sign = real(-1.0)
-                    column_a += sign * mu * t_a
-                    column_b += sign * mu * t_b
-                    if bound[axis] > real(0.0):
-                        add_term(ws, slot, start, -sign * t_a, -sign * t_b, vec6(), vec6(), bound[axis], lane)
-        if (state & CLOSED) != 0:
-            add_term(ws, slot, start, column_a / eps[0], column_b / eps[0], n_a, n_b, free[0], lane)
+    def couple(g: Graph, ws: Workspace, body: wp.array2d(dtype=wp.vec2i), env: int, slot: int, lane: int) -> bool:
+        """Bodies that share a contact are neighbours; False where there is no room for them."""
+        n = ws.body.shape[0]
+        for b in range(lane, n, wp.block_dim()):
+            clear(g, slot, n, b)
+            for e in range(ws.begin[slot, b], ws.begin[slot, b + 1]):
+                pair = body[env, ws.contact[slot, e]]
+                other = node(ws.number, pair[0]) + node(ws.number, pair[1]) - b
+                if other >= 0:
+                    connect(g, slot, b, other)
+        sync()
+        return analyse(g, slot, n, lane)
 
     @wp.func
-    def change(ws: Workspace, bodies: Bodies, env: int, slot: int, body: int, point: vec3) -> vec3:
+    def blocks(vv: mat33, vw: mat33, wv: mat33, ww: mat33) -> mat66:
+        a = mat66()
+        for i in range(3):
+            for j in range(3):
+                a[i, j] = vv[i, j]
+                a[i, 3 + j] = vw[i, j]
+                a[3 + i, j] = wv[i, j]
+                a[3 + i, 3 + j] = ww[i, j]
+        return a
+
+    @wp.func
+    def add_block(g: Graph, slot: int, row: int, column: int, a: mat66):
+        """Subtract from the block of a body's row where the factors hold it."""
+        e = g.row[slot, row]
+        while g.column[slot, e] != column:
+            e += 1
+        target = g.target[slot, e]
+        if target >= 0:
+            g.upper[slot, target] = g.upper[slot, target] - a
+        else:
+            g.lower[slot, -1 - target] = g.lower[slot, -1 - target] - a
+
+    @wp.func
+    def assemble_row(
+        g: Graph,
+        ws: Workspace,
+        com: wp.array2d(dtype=vec3),
+        inv_mass: wp.array2d(dtype=real),
+        inv_inertia: wp.array2d(dtype=mat33),
+        body: wp.array2d(dtype=wp.vec2i),
+        point: wp.array2d(dtype=vec3),
+        env: int,
+        slot: int,
+        b: int,
+    ):
+        """The six rows of one body: its mass and what its contacts add, in the factors' memory."""
+        index = ws.body[b]
+        vv = wp.diag(vec3(real(1.0) / inv_mass[env, index]))
+        vw = mat33()
+        wv = mat33()
+        ww = wp.inverse(inv_inertia[env, index])
+        bv = vec3()
+        bw = vec3()
+        for e in range(ws.begin[slot, b], ws.begin[slot, b + 1]):
+            i = ws.contact[slot, e]
+            pair = body[env, i]
+            matrix = ws.matrix[slot, i]
+            shift = ws.shift[slot, i]
+            other = pair[0]
+            if other == index:
+                shift = -shift
+                other = pair[1]
+            arm = point[env, i] - com[env, index]
+            turn = wp.skew(arm)
+            right = matrix * turn
+            left = turn * matrix
+            vv += matrix
+            vw -= right
+            wv += left
+            ww -= turn * right
+            bv -= shift
+            bw -= wp.cross(arm, shift)
+            column = node(ws.number, other)
+            if column >= 0:
+                far = wp.skew(point[env, i] - com[env, other])
+                add_block(g, slot, b, column, blocks(matrix, -(matrix * far), left, -(left * far)))
+        g.pivot[slot, g.step[slot, b]] = blocks(vv, vw, wv, ww)
+        ws.change[slot, b] = vec6(bv[0], bv[1], bv[2], bw[0], bw[1], bw[2])
+
+    @wp.func
+    def body_change(ws: Workspace, com: wp.array2d(dtype=vec3), env: int, slot: int, body: int, point: vec3) -> vec3:
         """J x of one body at a point."""
         u = vec3()
-        i = start_of(ws, body)
-        if i >= 0:
-            n = ws.system.shape[1]
-            dv = vec3(ws.system[slot, i, n], ws.system[slot, i + 1, n], ws.system[slot, i + 2, n])
-            dw = vec3(ws.system[slot, i + 3, n], ws.system[slot, i + 4, n], ws.system[slot, i + 5, n])
-            u = dv + wp.cross(dw, point - bodies.com[env, body])
+        b = node(ws.number, body)
+        if b >= 0:
+            x = ws.change[slot, b]
+            u = vec3(x[0], x[1], x[2]) + wp.cross(vec3(x[3], x[4], x[5]), point - com[env, body])
         return u
-
-    @wp.func
-    def update_states(ws: Workspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, tolerance: real, lane: int) -> int:
-        """Flip the states that fail, keep the impulses of the others; returns the number of flips."""
-        if lane == 0:
-            ws.flips[slot] = 0
-        sync()
-        for i in range(lane, contacts.count[env], wp.block_dim()):
-            body = contacts.body[env, i]
-            point = contacts.point[env, i]
-            du = change(ws, bodies, env, slot, body[1], point) - change(ws, bodies, env, slot, body[0], point)
-            relaxed = contacts.free[env, i] + contacts.frame[env, i] * du
-            eps = contacts.relaxation[env, i]
-            mu = contacts.mu[env, i]
-            k = contacts.directions[env, i]
-            state = contacts.state[env, i]
-            w = contacts.inv_mass[env, i]
-            if k == DISC:
-                slip = contacts.slip[env, i]
-                contacts.impulse[env, i] = cone_impulse(relaxed, eps, mu[0], state, slip)
-                after, turned, again = next_cone(relaxed, eps, w, mu[0], state, slip, tolerance)
-                contacts.slip[env, i] = turned
-                contacts.state[env, i] = after
-                if again:
-                    wp.atomic_add(ws.flips, slot, 1)
-            else:
-                bound = contacts.bound[env, i]
-                after = next_state(relaxed, eps, w[0], mu, bound, k, state, tolerance)
-                contacts.impulse[env, i] = state_impulse(relaxed, eps, mu, bound, k, state)
-                if after != state:
-                    wp.atomic_add(ws.flips, slot, 1)
-                    contacts.state[env, i] = after
-        sync()
-        return ws.flips[slot]
 
     @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
     def pivot(
         bodies: Bodies,
         contacts: Contacts,
+        g: Graph,
         ws: Workspace,
         limit: int,
         tolerance: real,
         iterations: wp.array(dtype=int),
     ):
         slot, lane = wp.tid()
-        for env in range(slot, contacts.count.shape[0], ws.system.shape[0]):
+        n = ws.body.shape[0]
+        for env in range(slot, contacts.count.shape[0], ws.flips.shape[0]):
             r = contacts.count[env]
             flips = r
             solves = int(0)
-            for i in range(r):
-                if contacts.directions[env, i] > 2 or contacts.directions[env, i] < 0:
+            if r > 0:
+                list_contacts(ws, contacts.body, env, slot, r, lane)
+                if not couple(g, ws, contacts.body, env, slot, lane):
                     flips = 0
             while flips > 0 and solves < limit:
-                load_masses(ws, bodies, env, slot, lane)
-                for i in range(r):
-                    state = contacts.state[env, i]
-                    if (state & CLOSED) != 0 or has_friction(state, contacts.bound[env, i], contacts.directions[env, i]):
-                        add_contact(ws, bodies, contacts, env, slot, i, lane)
-                flips = 0
-                if solve(ws.system, slot, ws.system.shape[1], lane):
-                    flips = update_states(ws, bodies, contacts, env, slot, tolerance, lane)
+                clear_factors(g, slot, n, lane)
+                for i in range(lane, r, wp.block_dim()):
+                    bound = vec2()
+                    if wp.static(frozen):
+                        bound = contacts.bound[env, i]
+                    slip = vec3()
+                    if wp.static(cone):
+                        slip = contacts.slip[env, i]
+                    matrix, shift = operator(
+                        contacts.frame[env, i],
+                        contacts.relaxation[env, i],
+                        contacts.free[env, i],
+                        contacts.mu[env, i],
+                        bound,
+                        contacts.directions[env, i],
+                        contacts.state[env, i],
+                        slip,
+                    )
+                    ws.matrix[slot, i] = matrix
+                    ws.shift[slot, i] = shift
+                if lane == 0:
+                    ws.flips[slot] = 0
+                sync()
+                for b in range(lane, n, wp.block_dim()):
+                    assemble_row(g, ws, bodies.com, bodies.inv_mass, bodies.inv_inertia, contacts.body, contacts.point, env, slot, b)
+                sync()
+                factorise(g, slot, n, lane)
+                solve(g, slot, n, ws.change, ws.scratch, lane)
+                for i in range(lane, r, wp.block_dim()):
+                    body = contacts.body[env, i]
+                    point = contacts.point[env, i]
+                    du = body_change(ws, bodies.com, env, slot, body[1], point) - body_change(ws, bodies.com, env, slot, body[0], point)
+                    bound = vec2()
+                    if wp.static(frozen):
+                        bound = contacts.bound[env, i]
+                    slip = vec3()
+                    if wp.static(cone):
+                        slip = contacts.slip[env, i]
+                    p, after, turned, again = update(
+                        contacts.free[env, i] + contacts.frame[env, i] * du,
+                        contacts.relaxation[env, i],
+                        contacts.inv_mass[env, i],
+                        contacts.mu[env, i],
+                        bound,
+                        contacts.directions[env, i],
+                        contacts.state[env, i],
+                        slip,
+                        tolerance,
+                    )
+                    contacts.impulse[env, i] = p
+                    if again:
+                        wp.atomic_add(ws.flips, slot, 1)
+                        contacts.state[env, i] = after
+                        if wp.static(cone):
+                            contacts.slip[env, i] = turned
+                sync()
+                flips = ws.flips[slot]
                 solves += 1
                 sync()
             if lane == 0:
                 iterations[env] = iterations[env] + solves
             sync()
 
-    return SimpleNamespace(Workspace=Workspace, pivot=pivot)
+    return SimpleNamespace(Graph=Graph, Workspace=Workspace, pivot=pivot)

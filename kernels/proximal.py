@@ -55,7 +55,7 @@ def functions(real) -> SimpleNamespace:
     alpha_least = real(1.0e-10) if double else real(1.0e-5)
     law = friction.functions(real)
     admissible, slope = law.admissible, law.slope
-    s = sparse.functions(real)
+    s = sparse.functions(real, 3)
     Graph, clear_factors, factorise, solve = s.Graph, s.clear_factors, s.factorise, s.solve
 
     @wp.struct

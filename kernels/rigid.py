@@ -11,7 +11,7 @@ from .types import scalar_types
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
-    """``point_velocity``, ``impulse_response`` and ``mobility``; arm: from the centre of mass to the point, world axes."""
+    """What a body does at a point; arm: from the centre of mass to the point, world axes."""
     t = scalar_types(real)
     vec3, mat33, spatial = t.vec3, t.mat33, t.spatial
 
@@ -21,10 +21,16 @@ def functions(real) -> SimpleNamespace:
         return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
 
     @wp.func
-    def impulse_response(inv_mass: real, inv_inertia: mat33, arm: vec3, impulse: vec3) -> spatial:
-        """M^-1 J^T p: change of velocity by an impulse at `arm`."""
-        dv = inv_mass * impulse
-        dw = inv_inertia * wp.cross(arm, impulse)
+    def wrench(arm: vec3, impulse: vec3) -> spatial:
+        """J^T p: an impulse at `arm` about the centre of mass."""
+        moment = wp.cross(arm, impulse)
+        return spatial(impulse[0], impulse[1], impulse[2], moment[0], moment[1], moment[2])
+
+    @wp.func
+    def response(inv_mass: real, inv_inertia: mat33, total: spatial) -> spatial:
+        """M^-1 of a wrench [N s, N m s]: change of velocity."""
+        dv = inv_mass * wp.spatial_top(total)
+        dw = inv_inertia * wp.spatial_bottom(total)
         return spatial(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
 
     @wp.func
@@ -32,4 +38,12 @@ def functions(real) -> SimpleNamespace:
         """J M^-1 J^T between two points of a body: velocity at `arm` for an impulse at `other`, 1/m E - [arm] I^-1 [other]."""
         return wp.diag(vec3(inv_mass)) - wp.skew(arm) * inv_inertia * wp.skew(other)
 
-    return SimpleNamespace(point_velocity=point_velocity, impulse_response=impulse_response, mobility=mobility)
+    @wp.func
+    def direction_mobility(inv_mass: real, inv_inertia: mat33, arm: vec3, direction: vec3) -> real:
+        """The same at one point along one unit direction: 1/m + (arm x d) . I^-1 (arm x d)."""
+        moment = wp.cross(arm, direction)
+        return inv_mass + wp.dot(moment, inv_inertia * moment)
+
+    return SimpleNamespace(
+        point_velocity=point_velocity, wrench=wrench, response=response, mobility=mobility, direction_mobility=direction_mobility
+    )

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Direct solution of block-sparse systems of 3 x 3 blocks, the contacts of one environment being the nodes of a graph.
+"""Direct solution of block-sparse systems, the nodes of a graph being the contacts or the bodies of one environment.
 
-Contacts are coupled where they share a body, so a heap of hundreds of contacts has a handful of neighbours each. The graph
-is ordered once by minimum degree (the node with the fewest neighbours left goes first, its neighbours become neighbours of
-each other), which tells where the factors have blocks; every factorisation of any matrix with that pattern then touches
-those blocks only. There is no search for pivots beyond a block: whoever solves must look at the residual.
+Contacts are coupled where they share a body (3 x 3 blocks), bodies where they share a contact (6 x 6), so that in a heap of
+hundreds each has a handful of neighbours. The graph is ordered once by minimum degree (the node with the fewest neighbours
+left goes first, its neighbours become neighbours of each other), which tells where the factors have blocks; every
+factorisation of any matrix with that pattern then touches those blocks only. There is no search for pivots beyond a block:
+whoever solves must look at the residual. Blocks of 3 are inverted with row pivoting, for contact blocks may have zeros on the
+diagonal; blocks of 6 are factorised, for a stiff body block times a rounded inverse would lose what its masses are worth
+(5 % of the steps of a heap ended above 1e-6 m/s).
 
 The lanes of one block share one problem. Neighbours are kept as bits, one row of words a node.
 """
@@ -21,10 +24,11 @@ WORD = 32
 
 
 @functools.cache
-def functions(real) -> SimpleNamespace:
-    """Bundle ``Graph`` and the functions ``clear``, ``connect``, ``analyse``, ``factorise`` and ``solve``."""
+def functions(real, size: int) -> SimpleNamespace:
+    """Bundle ``Graph`` of blocks size x size and the functions that work on it."""
     t = scalar_types(real)
-    vec3, mat33 = t.vec3, t.mat33
+    vector = t.vec3 if size == 3 else wp.types.vector(length=size, dtype=real)
+    matrix = t.mat33 if size == 3 else wp.types.matrix(shape=(size, size), dtype=real)
 
     @wp.struct
     class Graph:
@@ -40,13 +44,13 @@ def functions(real) -> SimpleNamespace:
         row: wp.array2d(dtype=int)  # [P, n + 1] first block of each row
         column: wp.array2d(dtype=int)  # [P, m]
         target: wp.array2d(dtype=int)  # [P, m] where the factors hold a block: upper[target], or lower[-1 - target]
-        diagonal: wp.array2d(dtype=mat33)  # [P, n]
-        block: wp.array2d(dtype=mat33)  # [P, m]
+        diagonal: wp.array2d(dtype=matrix)  # [P, n]
+        block: wp.array2d(dtype=matrix)  # [P, m]
         fill: wp.array2d(dtype=int)  # [P, n + 1] first block of each step in lower and upper
         later: wp.array2d(dtype=int)  # [P, m] the later step that shares the block
-        pivot: wp.array2d(dtype=mat33)  # [P, n] inverse of the block on the diagonal
-        lower: wp.array2d(dtype=mat33)  # [P, m] row `later`, column of the step
-        upper: wp.array2d(dtype=mat33)  # [P, m] row of the step, column `later`
+        pivot: wp.array2d(dtype=matrix)  # [P, n] inverse of the block on the diagonal, or its factors
+        lower: wp.array2d(dtype=matrix)  # [P, m] row `later`, column of the step
+        upper: wp.array2d(dtype=matrix)  # [P, m] row of the step, column `later`
 
     @wp.func
     def is_neighbour(g: Graph, slot: int, i: int, j: int) -> bool:
@@ -93,10 +97,11 @@ def functions(real) -> SimpleNamespace:
             e = g.row[slot, i]
             for w in range(words):
                 bits = g.adjacent[slot, i, w]
-                for b in range(WORD):
-                    if (bits >> wp.uint32(b)) & wp.uint32(1) != wp.uint32(0):
-                        g.column[slot, e] = WORD * w + b
-                        e += 1
+                while bits != wp.uint32(0):
+                    rest = bits & (bits - wp.uint32(1))  # without its lowest bit
+                    g.column[slot, e] = WORD * w + wp.bit_count((bits ^ rest) - wp.uint32(1))
+                    e += 1
+                    bits = rest
         sync()
         return True
 
@@ -168,54 +173,106 @@ def functions(real) -> SimpleNamespace:
     def clear_factors(g: Graph, slot: int, n: int, lane: int):
         """Zero the blocks of the factors: those that fill in start so."""
         for e in range(lane, g.fill[slot, n], wp.block_dim()):
-            g.lower[slot, e] = mat33()
-            g.upper[slot, e] = mat33()
+            g.lower[slot, e] = matrix()
+            g.upper[slot, e] = matrix()
         sync()
 
     @wp.func
-    def inverse(a: mat33) -> mat33:
-        """Inverse of a 3 x 3 block by elimination with row pivoting; zero where it is singular.
+    def inverse(a: matrix, n: int) -> matrix:
+        """Inverse of a block by elimination with row pivoting; zero along directions in which it is singular.
 
-        Cofactors (wp.inverse) lose all digits where two of three directions are nearly free.
+        Cofactors (wp.inverse) lose all digits where two of three directions are nearly free. n is the size: as an argument it
+        keeps loops from being unrolled.
         """
-        b = wp.identity(n=3, dtype=real)
-        for k in range(3):
+        b = wp.identity(n=size, dtype=real)
+        for k in range(n):
             r = int(k)
-            for i in range(k + 1, 3):
+            for i in range(k + 1, n):
                 if wp.abs(a[i, k]) > wp.abs(a[r, k]):
                     r = i
-            for j in range(3):
-                x = a[r, j]
+            p = real(0.0)
+            if a[r, k] != real(0.0):
+                p = real(1.0) / a[r, k]
+            for j in range(n):
+                x = p * a[r, j]
                 a[r, j] = a[k, j]
                 a[k, j] = x
-                y = b[r, j]
+                y = p * b[r, j]
                 b[r, j] = b[k, j]
                 b[k, j] = y
-            p = real(0.0)
-            if a[k, k] != real(0.0):
-                p = real(1.0) / a[k, k]
-            for j in range(3):
-                a[k, j] = p * a[k, j]
-                b[k, j] = p * b[k, j]
-            for i in range(3):
+            for i in range(n):
                 if i != k:
                     f = a[i, k]
-                    for j in range(3):
-                        a[i, j] = a[i, j] - f * a[k, j]
-                        b[i, j] = b[i, j] - f * b[k, j]
+                    if f != real(0.0):
+                        for j in range(n):
+                            a[i, j] = a[i, j] - f * a[k, j]
+                            b[i, j] = b[i, j] - f * b[k, j]
         return b
+
+    @wp.func
+    def lower_upper(a: matrix) -> matrix:
+        """L and U of a block in one matrix: L below the diagonal, U above, 1 / U_kk on it."""
+        for k in range(size):
+            a[k, k] = real(1.0) / a[k, k]
+            for i in range(k + 1, size):
+                f = a[i, k] * a[k, k]
+                a[i, k] = f
+                for j in range(k + 1, size):
+                    a[i, j] = a[i, j] - f * a[k, j]
+        return a
+
+    @wp.func
+    def divided(x: matrix, lu: matrix, n: int) -> matrix:
+        """X (L U)^-1, row by row; n is the size: as an argument it keeps the rows from being unrolled."""
+        for i in range(n):
+            y = x[i]
+            for k in range(size):
+                t = y[k]
+                for j in range(k):
+                    t -= y[j] * lu[j, k]
+                y[k] = t * lu[k, k]
+            for kk in range(size):
+                k = size - 1 - kk
+                t = y[k]
+                for j in range(k + 1, size):
+                    t -= y[j] * lu[j, k]
+                y[k] = t
+            x[i] = y
+        return x
+
+    @wp.func
+    def block_solve(lu: matrix, y: vector) -> vector:
+        """(L U)^-1 y."""
+        for i in range(size):
+            t = y[i]
+            for j in range(i):
+                t -= lu[i, j] * y[j]
+            y[i] = t
+        for ii in range(size):
+            i = size - 1 - ii
+            t = y[i]
+            for j in range(i + 1, size):
+                t -= lu[i, j] * y[j]
+            y[i] = t * lu[i, i]
+        return y
 
     @wp.func
     def factorise(g: Graph, slot: int, n: int, lane: int):
         """L U of the matrix in pivot, lower and upper, in place, step by step (right-looking)."""
         for s in range(n):
             if lane == 0:
-                g.pivot[slot, s] = inverse(g.pivot[slot, s])
+                if wp.static(size == 3):
+                    g.pivot[slot, s] = inverse(g.pivot[slot, s], size)
+                else:
+                    g.pivot[slot, s] = lower_upper(g.pivot[slot, s])
             sync()
             begin = g.fill[slot, s]
             end = g.fill[slot, s + 1]
             for e in range(begin + lane, end, wp.block_dim()):
-                g.lower[slot, e] = g.lower[slot, e] * g.pivot[slot, s]
+                if wp.static(size == 3):
+                    g.lower[slot, e] = g.lower[slot, e] * g.pivot[slot, s]
+                else:
+                    g.lower[slot, e] = divided(g.lower[slot, e], g.pivot[slot, s], size)
             sync()
             for e in range(begin + lane, end, wp.block_dim()):
                 i = g.later[slot, e]
@@ -231,7 +288,7 @@ def functions(real) -> SimpleNamespace:
             sync()
 
     @wp.func
-    def solve(g: Graph, slot: int, n: int, x: wp.array2d(dtype=vec3), y: wp.array2d(dtype=vec3), lane: int):
+    def solve(g: Graph, slot: int, n: int, x: wp.array2d(dtype=vector), y: wp.array2d(dtype=vector), lane: int):
         """x := A^-1 x with the factors; y [P, n] is scratch."""
         for i in range(lane, n, wp.block_dim()):
             y[slot, g.step[slot, i]] = x[slot, i]
@@ -247,7 +304,10 @@ def functions(real) -> SimpleNamespace:
                 total = y[slot, s]
                 for e in range(g.fill[slot, s], g.fill[slot, s + 1]):
                     total -= g.upper[slot, e] * y[slot, g.later[slot, e]]
-                y[slot, s] = g.pivot[slot, s] * total
+                if wp.static(size == 3):
+                    y[slot, s] = g.pivot[slot, s] * total
+                else:
+                    y[slot, s] = block_solve(g.pivot[slot, s], total)
         sync()
         for i in range(lane, n, wp.block_dim()):
             x[slot, i] = y[slot, g.step[slot, i]]

@@ -52,6 +52,7 @@ def scalar_types(real) -> SimpleNamespace:
     quat = wp.quatd if double else wp.quatf
     transform = wp.transformd if double else wp.transformf
     spatial = wp.spatial_vectord if double else wp.spatial_vectorf
+    vec5 = wp.types.vector(length=5, dtype=real)
 
     @wp.struct
     class Parameters:
@@ -61,6 +62,9 @@ def scalar_types(real) -> SimpleNamespace:
         friction: wp.array2d(dtype=vec2)  # [1|E, S] mu_s, mu_k
         contact: wp.array3d(dtype=real)  # [1|E, S, 5] k_n b_n k_t b_t v_s, NaN = Table 1 scaled
         gravity: wp.array(dtype=vec3)  # [1|E] m/s^2
+        # What the rows of a pair's contacts are made of, derived from the above when it changes (kernels/contacts.py):
+        pair_friction: wp.array2d(dtype=vec2)  # [1|E, P] mu_s, mu_k
+        pair_contact: wp.array2d(dtype=vec5)  # [1|E, P] k_n b_n k_t b_t v_s
 
     @wp.struct
     class Topology:
@@ -73,6 +77,7 @@ def scalar_types(real) -> SimpleNamespace:
         shape_size: wp.array(dtype=vec3)  # [S] half extents | radius | capsule: radius, half length along z
         surface_velocity: wp.array(dtype=vec3)  # [S] shape frame, m/s
         pairs: wp.array2d(dtype=int)  # [P, 2]
+        pair_body: wp.array(dtype=wp.vec2i)  # [P] bodies of the two shapes, -1 = world
         pair_slots: wp.array(dtype=int)  # [P + 1]
         slot_pair: wp.array(dtype=int)  # [C]
 
@@ -124,6 +129,7 @@ def scalar_types(real) -> SimpleNamespace:
         real=real,
         vec2=vec2,
         vec3=vec3,
+        vec5=vec5,
         mat33=mat33,
         quat=quat,
         transform=transform,

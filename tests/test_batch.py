@@ -259,7 +259,7 @@ def test_scenes_without_contacts_or_movable_bodies():
         ({"num_envs": 0}, "num_envs is 0; give a whole number of at least 1"),
         ({"directions": 1}, "directions is 1"),
         ({"rho_scale": 0.0}, "rho_scale is 0.0"),
-        ({"method": "simplex"}, "method is 'simplex'; choose one of auto, lemke, velocity_pivoting, proximal_newton, pgs"),
+        ({"method": "simplex"}, "method is 'simplex'; choose one of auto, velocity_pivoting, proximal_newton, pgs, lemke, murty"),
         ({"precision": "half"}, "choose one of float64, float32"),
         ({"formulation": "magic"}, "choose one of phantom_inertia"),
         ({"sliding": "no"}, "choose one of regularized, aligned, facets"),

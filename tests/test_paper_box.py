@@ -28,7 +28,7 @@ def stop(h: float, steps: int | None = None, **options) -> tuple[np.ndarray, dic
 
 
 @pytest.mark.parametrize(("h", "metres", "radians"), [(1e-2, 1e-3, 2e-3), (1e-3, 5e-5, 5e-5)])
-@pytest.mark.parametrize("method", ["auto", "lemke"])
+@pytest.mark.parametrize("method", ["auto", "lemke", "murty", "judice_pires"])
 def test_stops_where_the_exact_cone_stops(h, metres, radians, method):
     """Bars of the design: 1 mm and 2 mrad at 10 ms, 0.05 mm and 0.05 mrad at 1 ms; every step certified, no lift."""
     pose, seen = stop(h, method=method)

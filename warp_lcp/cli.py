@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: ``warp-lcp info SCENE`` says what is in a scene, ``warp-lcp run SCENE`` simulates it.
+"""The command line: ``warp-lcp info SCENE`` says what is in a scene, ``run SCENE`` simulates it, ``solve FILE`` solves problems.
 
 Bad input ends with one line on stderr and exit status 2. What is slow to import (warp, USD, rerun, rich) is imported
 where it is needed, so that ``--help`` and a mistyped option answer at once.
@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from .errors import MissingExtra, ModelError, WarpLcpError
+from .laws import Law
 
 if TYPE_CHECKING:
     from .logger import RerunLogger
@@ -86,7 +87,18 @@ def _parser() -> _Parser:
     )
     add("--rerun", metavar="SINK", help="stream to a file ending in .rrd, 'spawn', 'serve' or the URL of a viewer")
     add("--out", metavar="FILE.npz", help="write time, poses, velocities, status, residual and iterations")
+    from .cli_solve import add_arguments
+
+    solve = commands.add_parser("solve", help="solve complementarity problems from a file", allow_abbrev=False)
+    solve.set_defaults(action=_solve)
+    add_arguments(solve)
     return parser
+
+
+def _solve(arguments: argparse.Namespace) -> int:
+    from .cli_solve import run
+
+    return run(arguments)
 
 
 # ----------------------------------------------------------------------------------------------------------------- info
@@ -95,8 +107,7 @@ def _parser() -> _Parser:
 def _info(arguments: argparse.Namespace) -> int:
     from .usd import read_usd
 
-    law = {name: getattr(arguments, name) for name in ("formulation", "sliding", "directions")}
-    facts = describe(read_usd(arguments.scene), **law)
+    facts = describe(read_usd(arguments.scene), Law(arguments.formulation, arguments.sliding, arguments.directions))
     if arguments.json:
         print(json.dumps(facts))
     else:
@@ -104,21 +115,15 @@ def _info(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def describe(
-    reading: SceneReading, formulation: str = "phantom_inertia", sliding: str = "regularized", directions: int = 2
-) -> dict[str, Any]:
-    """What ``warp-lcp info`` says about a scene and what running it under a contact law takes, ready for JSON; SI units.
+def describe(reading: SceneReading, law: Law | None = None) -> dict[str, Any]:
+    """What ``warp-lcp info`` says about a scene and what it takes under a contact law, ready for JSON; SI units.
 
     What depends on the whole model (dofs, pairs, contact slots, bytes) is None where the scene cannot be simulated; the largest
     LCP is also None where the law is none.
 
     Raises:
         SceneError: there is no physics in the stage.
-        WarpLcpError: there is no such contact law.
     """
-    from .simulator import friction_of
-
-    friction = friction_of(formulation, sliding, directions)
     if not (reading.bodies or reading.shapes or reading.joints):
         from .usd import load_usd
 
@@ -136,29 +141,16 @@ def describe(
     facts |= {"dofs": None, "shapes": [{"name": n, "type": None, "body": None} for n in reading.shapes], "pairs": None}
     facts |= {"contact_slots": None, "max_contacts": None, "largest_lcp": None, "bytes_per_env": None, "kernels": None}
     if model is not None:
-        facts |= _model_facts(model, formulation, directions)
-    facts["friction"] = friction
+        facts |= _model_facts(model, law or Law())
+    facts["friction"] = (law or Law()).friction
     facts |= {"mass": reading.mass, "gravity": list(reading.gravity), "up_axis": reading.up_axis}
     facts |= {"meters_per_unit": reading.meters_per_unit, "kilograms_per_unit": reading.kilograms_per_unit}
     facts |= {"notes": list(report.notes), "ignored": [asdict(i) for i in report.ignored]}
     return facts | {"unsupported": [asdict(i) for i in report.unsupported]}
 
 
-def largest_lcp(contacts: int, formulation: str, directions: int) -> int | None:
-    """Unknowns of the largest LCP of a law; None for the cone, which is not one.
-
-    One normal impulse a contact, and for its k directions two slip parameters each (eq. 35), two impulses each and a slip (ref. 6
-    of the paper), or two bounded impulses in a mixed LCP (box and hybrid).
-    """
+def _model_facts(model: Model, law: Law) -> dict[str, Any]:
     from .methods import LCP_UNKNOWNS
-
-    if formulation == "phantom_inertia":  # the one that is assembled, up to a size
-        return min(contacts, LCP_UNKNOWNS // (1 + 2 * directions)) * (1 + 2 * directions)
-    each = {"anitescu_potra": 2 + 2 * directions, "box": 3, "hybrid": 3}
-    return contacts * each[formulation] if formulation in each else None
-
-
-def _model_facts(model: Model, formulation: str, directions: int) -> dict[str, Any]:
     from .model import JointType, ShapeType
     from .simulator import kernel_names
 
@@ -177,9 +169,9 @@ def _model_facts(model: Model, formulation: str, directions: int) -> dict[str, A
         "pairs": [[model.shape_names[a], model.shape_names[b]] for a, b in model.pairs],
         "contact_slots": model.num_slots,
         "max_contacts": model.max_contacts,
-        "largest_lcp": largest_lcp(model.max_contacts, formulation, directions),
-        "bytes_per_env": bytes_per_env(model, formulation),
-        "kernels": kernel_names(model),  # the same for every law: kernels/friction.py takes it as a number
+        "largest_lcp": None if law.is_cone else min(model.max_contacts, LCP_UNKNOWNS // law.unknowns) * law.unknowns,
+        "bytes_per_env": bytes_per_env(model, law.formulation),
+        "kernels": kernel_names(model, law=law),
     }
 
 
@@ -334,16 +326,21 @@ def _start_warp() -> None:
                 print(line, file=sys.stderr)
 
 
-def _simulator(model: Model, arguments: argparse.Namespace) -> Simulator:
+def _device(name: str | None) -> Any:
+    """The Warp device of --device."""
     import warp as wp
 
-    names = ("dt", "formulation", "method", "sliding", "directions", "rho_scale", "precision", "integrator")
-    options = {name: getattr(arguments, name) for name in names}
     aliases = ["cuda"] if wp.get_cuda_device_count() else []  # the current one; asking for it without any makes Warp chatter
     devices = [*(str(d) for d in wp.get_devices()), *aliases]
-    if arguments.device not in (None, *devices):
-        raise WarpLcpError(f"--device {arguments.device}: there is no such device; choose from: {', '.join(devices)}")
-    device = wp.get_device(arguments.device)
+    if name not in (None, *devices):
+        raise WarpLcpError(f"--device {name}: there is no such device; choose from: {', '.join(devices)}")
+    return wp.get_device(name)
+
+
+def _simulator(model: Model, arguments: argparse.Namespace) -> Simulator:
+    names = ("dt", "formulation", "method", "sliding", "directions", "rho_scale", "precision", "integrator")
+    options = {name: getattr(arguments, name) for name in names}
+    device = _device(arguments.device)
     needed, there = arguments.envs * bytes_per_env(model, arguments.formulation), _memory() if device.is_cpu else device.free_memory
     if needed > there:
         raise WarpLcpError(f"--envs {arguments.envs} takes {needed / 1e9:.3g} GB, {device} has {there / 1e9:.3g} GB; give fewer")

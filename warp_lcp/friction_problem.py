@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from .arrays import check_finite, device_of, is_single, on_device, read
 from .errors import WarpLcpError
-from .kernels import problems
+from .kernels import contact_problem
 from .kernels.types import LANES
 from .methods import contact_workspace, workspaces
 
@@ -62,18 +63,20 @@ def solve_contact(
     ('phantom_inertia', eqs. 29, 30) or within it ('anitescu_potra').
 
     Args:
-        W: [B, 3r, 3r] or [3r, 3r], 1/kg, order (n, t1, t2) in each contact; numpy, Warp, or anything with DLPack. May be singular
-            and slightly unsymmetric. float32 is solved in float32 where q is float32 too, everything else in float64.
+        W: [B, 3r, 3r] or [3r, 3r], 1/kg, order (n, t1, t2) in each contact; numpy, Warp, anything with ``__dlpack__`` or nested
+            lists. May be singular and slightly unsymmetric. Two float32 arrays are solved in float32, everything else in float64.
+            Arrays on a device stay there.
         q: [B, 3r] or [3r], free relative velocity, m/s.
         mu: [B, r], [r] or one number, friction coefficients.
         formulation: 'coulomb', 'phantom_inertia' or 'anitescu_potra'.
         method: 'auto' (the proximal Newton method), 'proximal_newton' or 'pgs' (block Gauss-Seidel).
         directions: k of the polygons, at angles j pi / k from t1.
         tolerance: largest residual of an answer that counts as solved, in parts of max |q|; None = 1e-10, in float32 1e-4.
-        device: Warp device; None = Warp's default.
+        device: Warp device; None = that of W and q if they are on one, Warp's default otherwise.
 
     Raises:
-        WarpLcpError: for arguments that do not fit together or numbers that are not finite.
+        WarpLcpError: for arguments that do not fit together or numbers that are not finite. Numbers on a GPU are not read back:
+            there an answer that is not a number is marked.
     """
     if formulation not in FORMULATIONS:
         raise WarpLcpError(
@@ -86,25 +89,21 @@ def solve_contact(
         )
     if int(directions) != directions or directions < 2:
         raise WarpLcpError(f"solve_contact: directions is {directions}; give a whole number of at least 2")
-    W, q, mu = (x.numpy() if isinstance(x, wp.array) else np.asarray(x) for x in (W, q, mu))
-    kind = np.float32 if W.dtype == q.dtype == np.float32 else np.float64
-    W, q, mu = np.ascontiguousarray(W, dtype=kind), np.ascontiguousarray(q, dtype=kind), np.asarray(mu, dtype=kind)
-    W, q = (W[None] if W.ndim == 2 else W), (q[None] if q.ndim == 1 else q)
-    if W.ndim != 3 or q.ndim != 2 or W.shape != (*q.shape, q.shape[1]) or q.shape[1] % 3:
-        raise WarpLcpError(f"solve_contact: W has shape {W.shape} and q {q.shape}; give [B, 3r, 3r] and [B, 3r]")
+    me = "solve_contact"
+    W, q, mu = read(me, "W", W), read(me, "q", q), read(me, "mu", mu)
+    if W.ndim not in (2, 3) or W.ndim != q.ndim + 1 or W.shape != (*q.shape, q.shape[-1]) or q.shape[-1] % 3:
+        raise WarpLcpError(f"{me}: W has shape {tuple(W.shape)} and q {tuple(q.shape)}; give [B, 3r, 3r] and [B, 3r], or [3r, 3r] and [3r]")
+    real = wp.float32 if is_single(W) and is_single(q) else wp.float64
+    device = device_of(me, device, W=W, q=q)
+    for name, x in (("W", W), ("q", q), ("mu", mu)):
+        check_finite(me, name, x)
+    W, q = on_device(W, real, device), on_device(q, real, device)
+    if q.ndim == 1:
+        W, q = W.reshape((1, *W.shape)), q.reshape((1, *q.shape))
     batch, contacts = q.shape[0], q.shape[1] // 3
-    if mu.shape not in ((), (contacts,), (batch, contacts)):
-        raise WarpLcpError(f"solve_contact: mu has shape {mu.shape}; give {(batch, contacts)}, {(contacts,)} or one number")
-    mu = np.ascontiguousarray(np.broadcast_to(mu, (batch, contacts)))
-    for name, array in (("W", W), ("q", q), ("mu", mu)):
-        bad = np.argwhere(~np.isfinite(array) if name != "mu" else ~(np.isfinite(array) & (array >= 0.0)))
-        if len(bad):
-            where = tuple(int(i) for i in bad[0])
-            what = "finite" if name != "mu" else "finite and not negative"
-            raise WarpLcpError(f"solve_contact: {name}{list(where)} is {array[where]}; it must be {what}")
-    device, real = wp.get_device(device), wp.float64 if kind is np.float64 else wp.float32
+    mu = _coefficients(mu, batch, contacts, real, device)
     if tolerance is None:
-        tolerance = 1e-10 if kind is np.float64 else 1e-4
+        tolerance = 1e-10 if real is wp.float64 else 1e-4
     code = {"coulomb": 1, "phantom_inertia": directions, "anitescu_potra": -directions}[formulation]
     blocks = contacts * (contacts - 1)
     slots = workspaces(batch, 20 * blocks, device)
@@ -116,10 +115,23 @@ def solve_contact(
     if batch == 0 or contacts == 0:
         return solution
     sweeps, limit = METHODS[method]
-    inputs = [*(wp.array(x, dtype=real, device=device) for x in (W, q, mu)), int(code), limit, sweeps, tolerance]
+    inputs = [W, q, mu, int(code), limit, sweeps, tolerance]
     inputs += contact_workspace(real, slots, contacts, blocks, blocks // 2, device)
     sizes = wp.zeros((batch, 2), dtype=real, device=device)
     s = solution
     outputs = [s.impulse, s.velocity, s.residual, s.natural_map, s.cone_energy, sizes, s.asymmetry, s.iterations, s.status]
-    wp.launch_tiled(problems.make(real), dim=[slots], inputs=inputs + outputs, block_dim=LANES, device=device)
+    wp.launch_tiled(contact_problem.make(real), dim=[slots], inputs=inputs + outputs, block_dim=LANES, device=device)
     return solution
+
+
+def _coefficients(mu: Any, batch: int, contacts: int, real: Any, device: Any) -> wp.array:
+    """mu as [B, r] on the device. One number or [r] is read on the host."""
+    if isinstance(mu, wp.array) and mu.shape == (batch, contacts) and not wp.get_device(mu.device).is_cpu:
+        return on_device(mu, real, device)  # without reading it back
+    mu = np.asarray(mu.numpy() if isinstance(mu, wp.array) else mu, dtype=float)
+    if mu.shape not in ((), (contacts,), (batch, contacts)):
+        raise WarpLcpError(f"solve_contact: mu has shape {mu.shape}; give {(batch, contacts)}, {(contacts,)} or one number")
+    if (mu < 0.0).any():
+        where = [int(i) for i in np.argwhere(mu < 0.0)[0]]
+        raise WarpLcpError(f"solve_contact: mu{where or ''} is {mu[tuple(where)]}; it must not be negative")
+    return on_device(np.broadcast_to(mu, (batch, contacts)), real, device)

@@ -7,14 +7,17 @@ read-back), entered in METHODS.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from .errors import WarpLcpError
-from .kernels import lcp, lemke, pgs, pivoting, problems, proximal
+from .kernels import contact_problem, lcp, pgs, pivoting, problem, proximal, sparse
 from .kernels.types import LANES, scalar_types
+from .laws import Law
 from .model import JointType, Model
 
 if TYPE_CHECKING:
@@ -24,45 +27,58 @@ if TYPE_CHECKING:
 GPU_WORKSPACES = 2048
 #: ... but no more than this many bytes in all.
 GPU_WORKSPACE_BYTES = 2**28
-#: Largest LCP that Lemke's method takes: its tableau grows with the square. Larger problems are left to other methods.
+#: Largest LCP that is assembled: its matrix grows with the square. Larger problems are left to other methods.
 LCP_UNKNOWNS = 2000
 
 
 def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
-    """Workspace of `slots` problems of at most n unknowns for the Lemke kernels."""
-    ws = lemke.functions(real).LcpWorkspace()
+    """Workspace of `slots` plain LCPs of at most n unknowns; bounds other than 0 <= z are the kernel's to write."""
+    ws = problem.functions(real).LcpWorkspace()
     ws.M = wp.empty((slots, n, n), dtype=real, device=device)
-    ws.q = wp.empty((slots, n), dtype=real, device=device)
-    ws.z = wp.empty((slots, n), dtype=real, device=device)
-    ws.tableau = wp.empty((slots, n, n + 2), dtype=real, device=device)
-    ws.scale = wp.empty((slots, n), dtype=real, device=device)
-    ws.basic = wp.empty((slots, n), dtype=int, device=device)
-    ws.nonbasic = wp.empty((slots, n + 1), dtype=int, device=device)
+    ws.system = wp.empty((slots, n, n + 2), dtype=real, device=device)
+    for name in ("q", "z", "x", "w", "row_scale", "column_scale"):
+        setattr(ws, name, wp.empty((slots, n), dtype=real, device=device))
+    for name in ("state", "basic", "wrong", "seen"):
+        setattr(ws, name, wp.empty((slots, n), dtype=int, device=device))
+    for name in ("member", "nonbasic"):
+        setattr(ws, name, wp.empty((slots, n + 1), dtype=int, device=device))
+    ws.lower = wp.zeros((slots, n), dtype=real, device=device)
+    ws.upper = wp.full((slots, n), np.inf, dtype=real, device=device)
+    ws.error = wp.empty((slots, n), dtype=wp.float64, device=device)
     return ws
 
 
-def contact_workspace(real: Any, slots: int, n: int, blocks: int, fill: int, device: Any) -> tuple[Any, Any]:
-    """Graph and ContactProblem of `slots` problems of at most n contacts, for the proximal kernels.
+def graph_workspace(real: Any, size: int, slots: int, n: int, blocks: int, fill: int, device: Any) -> Any:
+    """Graph of `slots` block-sparse systems of at most n nodes, blocks of size x size (kernels/sparse.py).
 
-    blocks: room for pairs of contacts that share a body, each counted twice; fill: room for blocks of a triangular factor.
+    blocks: room for pairs of neighbours, each counted twice; fill: room for blocks of a triangular factor.
     """
-    t, f = scalar_types(real), proximal.functions(real)
-    graph, problem = f.Graph(), f.ContactProblem()
+    graph = sparse.functions(real, size).Graph()
+    matrix = graph._cls.vars["pivot"].type.dtype
 
     def empty(n: int, dtype: Any) -> wp.array:
         return wp.empty((slots, max(n, 1)), dtype=dtype, device=device)
 
-    graph.adjacent = wp.empty((slots, n, (n + 31) // 32), dtype=wp.uint32, device=device)
+    graph.adjacent = wp.empty((slots, max(n, 1), (n + 31) // 32), dtype=wp.uint32, device=device)
     graph.degree, graph.order, graph.step = (empty(n, int) for _ in range(3))
     graph.row, graph.fill = empty(n + 1, int), empty(n + 1, int)
     graph.column, graph.target, graph.later = empty(blocks, int), empty(blocks, int), empty(fill, int)
-    graph.diagonal, graph.pivot = empty(n, t.mat33), empty(n, t.mat33)
-    graph.block, graph.lower, graph.upper = empty(blocks, t.mat33), empty(fill, t.mat33), empty(fill, t.mat33)
-    problem.free, problem.rho, problem.impulse, problem.velocity = (empty(n, t.vec3) for _ in range(4))
-    problem.centre, problem.best, problem.step, problem.change = (empty(n, t.vec3) for _ in range(4))
-    problem.mu, problem.bound = empty(n, t.vec2), empty(n, t.vec2)
-    problem.directions, problem.error = empty(n, int), empty(n, real)
-    return graph, problem
+    graph.diagonal, graph.pivot = empty(n, matrix), empty(n, matrix)
+    graph.block, graph.lower, graph.upper = empty(blocks, matrix), empty(fill, matrix), empty(fill, matrix)
+    return graph
+
+
+def contact_workspace(real: Any, slots: int, n: int, blocks: int, fill: int, device: Any) -> tuple[Any, Any]:
+    """Graph and ContactProblem of `slots` problems of at most n contacts, for the proximal kernels."""
+    t, problem = scalar_types(real), proximal.functions(real).ContactProblem()
+
+    def empty(dtype: Any) -> wp.array:
+        return wp.empty((slots, max(n, 1)), dtype=dtype, device=device)
+
+    problem.free, problem.rho, problem.impulse, problem.velocity = (empty(t.vec3) for _ in range(4))
+    problem.centre, problem.best, problem.step, problem.change = (empty(t.vec3) for _ in range(4))
+    problem.mu, problem.bound, problem.directions, problem.error = empty(t.vec2), empty(t.vec2), empty(int), empty(real)
+    return graph_workspace(real, 3, slots, n, blocks, fill, device), problem
 
 
 def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
@@ -70,16 +86,16 @@ def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
     return 1 if device.is_cpu else max(1, min(num_envs, GPU_WORKSPACES, GPU_WORKSPACE_BYTES // (8 * max(scalars, 1))))
 
 
-class Lemke:
-    """Lemke's method on the assembled LCP of eq. 39, no fallback."""
+class AssembledLCP:
+    """A method for dense LCPs ('lemke', 'murty' or 'judice_pires') on the assembled LCP of eq. 39, no fallback."""
 
-    def __init__(self, model: Model, real: Any):
-        self.kernel = lcp.make(real)
+    def __init__(self, solver: str, model: Model, real: Any, law: Law):
+        self.kernel = lcp.make(real, solver, law.has_generators)
 
     def prepare(self, sim: Simulator) -> None:
         real = sim.real
-        r = min(sim.model.max_contacts, LCP_UNKNOWNS // (1 + 2 * sim.directions))
-        n = r * (1 + 2 * sim.directions)
+        r = min(sim.model.max_contacts, LCP_UNKNOWNS // sim.law.unknowns)
+        n = r * sim.law.unknowns
         slots = workspaces(sim.num_envs, 2 * n * n + 15 * r * r, sim.device)
         self.lcp = lcp_workspace(real, slots, n, sim.device)
         ws = lcp.functions(real).ContactWorkspace()
@@ -104,8 +120,8 @@ class ProximalNewton:
     #: Room for coupled contacts and for blocks of a factor, per contact.
     NEIGHBOURS, FILL = 128, 256
 
-    def __init__(self, model: Model, real: Any):
-        self.kernel = problems.make_contacts(real)
+    def __init__(self, model: Model, real: Any, law: Law):
+        self.kernel = contact_problem.make_contacts(real)
 
     def prepare(self, sim: Simulator) -> None:
         n = sim.model.max_contacts
@@ -120,25 +136,41 @@ class ProximalNewton:
 
 
 class VelocityPivoting:
-    """Principal pivoting on contact states in the velocities; contacts with more than two directions are not for it."""
+    """Principal pivoting on contact states in the velocities, for laws with two friction axes or a disc."""
 
     LIMIT = 12
+    #: Room for neighbours and for blocks of a triangular factor, per body.
+    NEIGHBOURS, FILL = 32, 64
 
-    def __init__(self, model: Model, real: Any):
+    def __init__(self, model: Model, real: Any, law: Law):
         self.movable = np.flatnonzero(model.joint_type == JointType.FREE)
         self.single = len(self.movable) == 1
-        self.kernel = pivoting.make_single(real) if self.single else pivoting.make(real).pivot
+        kind = (real, law.is_cone, law.has_frozen_limits)
+        self.parts = None if self.single else pivoting.make(*kind)
+        self.kernel = pivoting.make_single(*kind) if self.parts is None else self.parts.pivot
 
     def prepare(self, sim: Simulator) -> None:
-        if self.single:
+        if self.parts is None:
             return
-        n = sim.model.dofs
-        self.slots = workspaces(sim.num_envs, n * n, sim.device)
-        ws = self.workspace = pivoting.make(sim.real).Workspace()
-        ws.system = wp.empty((self.slots, n, n + 1), dtype=sim.real, device=sim.device)
-        start = np.full(sim.model.num_bodies, -1, dtype=np.int32)
-        start[self.movable] = 6 * np.arange(len(self.movable))
-        ws.start = wp.array(start, dtype=int, device=sim.device)
+        n, contacts = len(self.movable), sim.model.max_contacts
+        blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
+        self.slots = workspaces(sim.num_envs, 72 * (n + fill) + 14 * contacts, sim.device)
+        self.graph = graph_workspace(sim.real, 6, self.slots, n, blocks, fill, sim.device)
+        ws = self.workspace = self.parts.Workspace()
+        number = np.full(sim.model.num_bodies, -1, dtype=np.int32)
+        number[self.movable] = np.arange(n)
+        ws.number = wp.array(number, dtype=int, device=sim.device)
+        ws.body = wp.array(self.movable.astype(np.int32), dtype=int, device=sim.device)
+        t, vec6 = scalar_types(sim.real), wp.types.vector(length=6, dtype=sim.real)
+        for name, width, dtype in (
+            ("begin", n + 1, int),
+            ("contact", 2 * contacts, int),
+            ("matrix", contacts, t.mat33),
+            ("shift", contacts, t.vec3),
+            ("change", n, vec6),
+            ("scratch", n, vec6),
+        ):
+            setattr(ws, name, wp.empty((self.slots, max(width, 1)), dtype=dtype, device=sim.device))
         ws.flips = wp.zeros(self.slots, dtype=int, device=sim.device)
 
     def launch(self, sim: Simulator) -> None:
@@ -146,7 +178,7 @@ class VelocityPivoting:
         if self.single:
             sim.launch(self.kernel, [sim.bodies, int(self.movable[0]), sim.rows, *tail])
         else:
-            inputs = [sim.bodies, sim.rows, self.workspace, *tail]
+            inputs = [sim.bodies, sim.rows, self.graph, self.workspace, *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
@@ -155,7 +187,7 @@ class BlockPGS:
 
     SWEEPS = 50
 
-    def __init__(self, model: Model, real: Any):
+    def __init__(self, model: Model, real: Any, law: Law):
         self.kernel = pgs.make(real)
 
     def prepare(self, sim: Simulator) -> None:
@@ -169,31 +201,39 @@ class BlockPGS:
         )
 
 
+#: Methods that want the law as an LCP.
+LCP_METHODS = ("lemke", "murty", "judice_pires")
+
 #: Methods by the name that users give; each is tried on the environments that those before it left unsolved. Where none
 #: certifies its answer, the best is applied.
-METHODS: dict[str, tuple[type, ...]] = {
+METHODS: dict[str, tuple[Callable[[Model, Any, Law], Any], ...]] = {
     "auto": (VelocityPivoting, ProximalNewton, BlockPGS),
-    "lemke": (Lemke,),
     "velocity_pivoting": (VelocityPivoting,),
     "proximal_newton": (ProximalNewton,),
     "pgs": (BlockPGS,),
+    **{name: (partial(AssembledLCP, name),) for name in LCP_METHODS},
 }
 
-#: Those that assemble the LCP of eq. 39, which no other formulation than 'phantom_inertia' has.
-ASSEMBLING = ("lemke",)
 
-
-def chosen(name: str, precision: str) -> tuple[type, ...]:
-    """The methods behind a name.
+def chosen(name: str, precision: str, law: Law) -> tuple[Callable[[Model, Any, Law], Any], ...]:
+    """The methods behind a name, for a precision and a law.
 
     float32 does not resolve the stiffness of Table 1: a velocity of 5 m/s is known to 5e-7 m/s, and over eps_n that is
-    more than the impulse itself. Block PGS does not divide by eps, so it is what 'auto' means there.
+    more than the impulse itself. The proximal method and block PGS do not divide by eps, so they are what 'auto' means there.
 
     Raises:
-        WarpLcpError: for velocity pivoting in float32.
+        WarpLcpError: where the method does not take the law, or not in this precision.
     """
-    if precision == "float32" and name == "auto":
-        return (BlockPGS,)
-    if precision == "float32" and name == "velocity_pivoting":
-        raise WarpLcpError("method 'velocity_pivoting' needs precision 'float64': float32 does not resolve contact stiffness; choose 'pgs'")
+    if name == "auto":
+        return METHODS["auto"] if law.has_axes and precision == "float64" else METHODS["auto"][1:]
+    if name == "velocity_pivoting":
+        if precision == "float32":
+            raise WarpLcpError(f"method {name!r} needs precision 'float64': float32 does not resolve contact stiffness; choose 'auto'")
+        if not law.has_axes:
+            what = law.formulation if law.has_generators else f"directions = {law.directions}"
+            raise WarpLcpError(
+                f"method {name!r} takes two friction axes or Coulomb's cone, not {what}; choose auto, proximal_newton or lemke"
+            )
+    if law.is_cone and name in LCP_METHODS:
+        raise WarpLcpError(f"method {name!r} solves LCPs, and the cone of 'coulomb' is none; choose auto, proximal_newton or pgs")
     return METHODS[name]

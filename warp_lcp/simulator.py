@@ -15,12 +15,11 @@ import warp as wp
 from .errors import SimulationError, WarpLcpError
 from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset
 from .kernels.types import scalar_types
-from .methods import ASSEMBLING, METHODS, chosen
+from .laws import Law
+from .methods import METHODS, chosen
 from .model import Model, ShapeType
 from .rollout import Recorder, Rollout
 
-FORMULATIONS = ("phantom_inertia", "anitescu_potra", "box", "hybrid", "coulomb")
-SLIDING = ("regularized", "aligned", "facets")
 INTEGRATORS = ("euler", "midpoint")
 PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.float32)}
 #: Parameters that may differ between environments, and what their numbers must be.
@@ -81,9 +80,10 @@ class Simulator:
         model: the scene.
         num_envs: number of environments E.
         dt: step size h [s].
-        formulation: contact law, see docs/theory.md.
-        method: how the contact problem is solved: 'lemke', 'velocity_pivoting', 'pgs', or 'auto': velocity pivoting, then
-            Lemke's method, then pgs for the environments that are not solved by then (in float32: pgs alone).
+        formulation: contact law, see docs/theory.md: 'phantom_inertia', 'anitescu_potra', 'box', 'hybrid' or 'coulomb' (the exact cone).
+        method: how the contact problem is solved: 'velocity_pivoting', 'proximal_newton', 'pgs', 'lemke', 'murty', 'judice_pires', or
+            'auto': velocity pivoting where the law has axes (not in float32), then the proximal Newton method, then pgs, each for
+            the environments that are not solved by then.
         sliding: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes throughout).
         directions: k, friction directions of a sticking contact, at least 2.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
@@ -123,12 +123,10 @@ class Simulator:
         device: Any = None,
         strict: bool = False,
     ):
-        check_law(formulation, sliding, directions)
+        self.law = Law(formulation, sliding, directions)
         _choice("method", method, tuple(METHODS))
         _choice("precision", precision, tuple(PRECISIONS))
         _choice("integrator", integrator, INTEGRATORS)
-        if method in ASSEMBLING and formulation != "phantom_inertia":
-            raise WarpLcpError(f"method {method!r} solves the LCP of 'phantom_inertia'; for {formulation!r} choose auto or proximal_newton")
         if int(num_envs) != num_envs or num_envs < 1:
             raise WarpLcpError(f"num_envs is {num_envs}; give a whole number of at least 1")
         if not (np.isfinite(dt) and dt > 0.0):
@@ -138,8 +136,7 @@ class Simulator:
         self.model, self.num_envs, self.dt = model, int(num_envs), float(dt)
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
-        self.directions, self.rho_scale, self.strict = int(directions), float(rho_scale), bool(strict)
-        self._law = _law(formulation, sliding, self.directions)
+        self.directions, self.rho_scale, self.strict = self.law.directions, float(rho_scale), bool(strict)
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
         self.tolerance = TOLERANCE
@@ -149,6 +146,7 @@ class Simulator:
         self._allocate()
         self._load_kernels()
         self._graphs: dict[str, Any] = {}
+        self._combine_pairs()
         self._recorder: Recorder | None = None
         self.time = 0.0
         self.last_count = 0
@@ -240,6 +238,17 @@ class Simulator:
             else:
                 setattr(self.parameters, name, self._constant(value, present.dtype))
                 self._graphs.clear()  # they hold the address of the old array
+        self._combine_pairs()
+
+    def _combine_pairs(self) -> None:
+        """Friction and contact parameters of the pairs, from those of their shapes and bodies."""
+        p, t, pairs = self.parameters, self._types, len(self.model.pairs)
+        rows = max(p.mass.shape[0], p.friction.shape[0], p.contact.shape[0])
+        if p.pair_contact is None or p.pair_contact.shape != (rows, pairs):
+            p.pair_friction = wp.empty((rows, pairs), dtype=t.vec2, device=self.device)
+            p.pair_contact = wp.empty((rows, pairs), dtype=t.vec5, device=self.device)
+            self._graphs.clear()
+        wp.launch(self._kernels.combine_pairs, dim=(rows, pairs), inputs=[self.topology, p], device=self.device)
 
     def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
         if name not in PARAMETERS:
@@ -310,7 +319,7 @@ class Simulator:
         self.unsolved.fill_(1)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
-        rows = [*scene, self.bodies, self.slots, h, *self._law, self.rows]
+        rows = [*scene, self.bodies, self.slots, h, *self.law.row_arguments, self.rows]
         self.launch(k.contact_rows, rows, self.model.max_contacts)
         for i, method in enumerate(self._methods):
             method.launch(self)
@@ -368,6 +377,8 @@ class Simulator:
         topology.shape_size = self._constant(m.shape_size, t.vec3)
         topology.surface_velocity = self._constant(m.shape_surface_velocity, t.vec3)
         topology.pairs, topology.pair_slots = ints(m.pairs), ints(m.pair_slots)
+        pair_body = np.where(m.pairs >= 0, m.shape_body[m.pairs], -1) if len(m.pairs) else np.zeros((0, 2))
+        topology.pair_body = wp.array(pair_body.astype(np.int32), dtype=wp.vec2i, device=self.device)
         topology.slot_pair = ints(np.repeat(np.arange(len(m.pairs)), np.diff(m.pair_slots)))
 
         parameters = self.parameters = t.Parameters()
@@ -398,7 +409,7 @@ class Simulator:
         rows.point, rows.inv_mass, rows.relaxation, rows.shift, rows.free, rows.impulse, rows.velocity, rows.best_impulse = (
             self._array(r, t.vec3) for _ in range(8)
         )
-        rows.slip = self._array(r if self.formulation == "coulomb" else 0, t.vec3)
+        rows.slip = self._array(r if self.law.is_cone else 0, t.vec3)
         rows.gap, rows.damping = self._array(r, self.real), self._array(r, self.real)
         rows.frame, rows.mu, rows.bound = self._array(r, t.mat33), self._array(r, t.vec2), self._array(r, t.vec2)
 
@@ -412,7 +423,7 @@ class Simulator:
 
     def _load_kernels(self) -> None:
         self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator)
-        self._methods = [method(self.model, self.real) for method in chosen(self.method, self.precision)]
+        self._methods = [method(self.model, self.real, self.law) for method in chosen(self.method, self.precision, self.law)]
         for method in self._methods:
             method.prepare(self)
         pair_kernels = [kernel for kernel, *_ in self._pair_kernels]
@@ -430,6 +441,7 @@ def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNames
     stages = SimpleNamespace(
         kinematics=body.kinematics,
         free_motion=body.free_motion,
+        combine_pairs=rows.combine_pairs,
         select_contacts=rows.select_contacts,
         contact_rows=rows.contact_rows,
         certify=certify.make(real),
@@ -448,64 +460,14 @@ def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNames
     return stages, pairs
 
 
-def kernel_names(model: Model, method: str = "auto", precision: str = "float64", integrator: str = "euler") -> list[str]:
+def kernel_names(
+    model: Model, method: str = "auto", precision: str = "float64", law: Law | None = None, integrator: str = "euler"
+) -> list[str]:
     """Names of the kernels that a Simulator of the model compiles."""
-    real = PRECISIONS[precision][0]
+    real, law = PRECISIONS[precision][0], law or Law()
     stages, pairs = stage_kernels(model, real, integrator)
-    solvers = [kind(model, real).kernel for kind in chosen(method, precision)]
+    solvers = [kind(model, real, law).kernel for kind in chosen(method, precision, law)]
     return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *(k for k, *_ in pairs), *solvers)]
-
-
-def _law(formulation: str, sliding: str, directions: int) -> tuple[int, int, int]:
-    """What kernels/contacts.py needs to know of a contact law: (sliding, directions of a sticking contact, frozen limits?)."""
-    fixed = SLIDING.index("facets")
-    return {
-        "phantom_inertia": (SLIDING.index(sliding), directions, 0),
-        "anitescu_potra": (fixed, -directions, 0),
-        "box": (fixed, directions, 1),
-        "hybrid": (SLIDING.index("regularized"), directions, 1),
-        "coulomb": (len(SLIDING), 1, 0),
-    }[formulation]
-
-
-def check_law(formulation: str, sliding: str, directions: int) -> None:
-    """Is there such a contact law?
-
-    Raises:
-        WarpLcpError: if not; says what there is.
-    """
-    _choice("formulation", formulation, FORMULATIONS)
-    _choice("sliding", sliding, SLIDING)
-    if int(directions) != directions or directions < 2:
-        raise WarpLcpError(f"directions is {directions}; give a whole number of at least 2")
-
-
-def friction_of(formulation: str = "phantom_inertia", sliding: str = "regularized", directions: int = 2) -> str:
-    """One line: how isotropic friction is under a contact law.
-
-    Half-way between two of k fixed directions a polygon around the cone has mu / cos(pi / 2k), one within it mu cos(pi / 2k);
-    distances of stopping are as its inverse (measured: tests/test_formulations.py).
-    """
-    check_law(formulation, sliding, directions)
-    least = float(np.cos(0.5 * np.pi / directions))
-    less, more = f"{100 * (1 - least):.2g} %", f"{100 * (1 / least - 1):.2g} %"
-    around = f"fixed facets around the cone, from world x, +{more} friction between directions (stops up to {less} too early)"
-    sticking = f"the limit of a sticking contact is exact along the predicted slip (k = {directions}: at most +{more} elsewhere)"
-    frozen = "limits follow the normal force of the step before"
-    if formulation == "coulomb":
-        return "coulomb: exact"
-    if formulation == "anitescu_potra":
-        within = f"fixed facets within the cone, from world x, -{less} friction between directions (stops up to {more} too far)"
-        return f"anitescu_potra, k = {directions}: {within}"
-    if formulation == "box":
-        return f"box, k = {directions}: {around}; {frozen}"
-    if formulation == "hybrid":
-        return f"hybrid: isotropic while sliding; {sticking}; {frozen}"
-    return {
-        "facets": f"phantom_inertia, facets, k = {directions}: {around}",
-        "aligned": f"phantom_inertia, aligned: isotropic while sliding, no friction across the slip; {sticking}",
-        "regularized": f"phantom_inertia, regularized: isotropic while sliding; {sticking}",
-    }[sliding]
 
 
 def _choice(what: str, value: str, choices: tuple[str, ...]) -> None:

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Other engines on our scenes, each in an interpreter of its own, because their requirements exclude one another.
+
+A peer is an entry of PEERS and a script in adapters/ that its interpreter runs (adapters/protocol.py says what the two sides
+tell each other). `python -m benchmarks peers install` makes the interpreters; a peer without one is left out.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / ".peers"
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Another engine.
+
+    Attributes:
+        name: of its folder and its adapter, adapters/on_<name>.py.
+        requirements: what pip installs into its interpreter, versions pinned.
+        variants: settings worth comparing, by the name they have in tables; the adapter reads the settings.
+        adapter: the script, if it is elsewhere.
+    """
+
+    name: str
+    requirements: tuple[str, ...]
+    variants: dict[str, dict[str, Any]]
+    adapter: Path = field(default=Path())
+
+    def __post_init__(self) -> None:
+        if self.adapter == Path():
+            object.__setattr__(self, "adapter", Path(__file__).parent / "adapters" / f"on_{self.name}.py")
+
+    def python(self, folder: Path) -> Path:
+        """Its interpreter."""
+        return folder / self.name / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+    def marker(self, folder: Path) -> Path:
+        """Written when everything is installed, with the requirements in it."""
+        return folder / self.name / "installed.txt"
+
+    def installed(self, folder: Path) -> bool:
+        """Whether its interpreter is there, complete and with the versions asked for."""
+        marker = self.marker(folder)
+        return self.python(folder).exists() and marker.exists() and marker.read_text().split() == list(self.requirements)
+
+    def install(self, folder: Path) -> None:
+        """Make its interpreter, with Python's venv and pip as they are configured on this machine."""
+        self.marker(folder).unlink(missing_ok=True)
+        subprocess.run([sys.executable, "-m", "venv", str(folder / self.name)], check=True)
+        subprocess.run([str(self.python(folder)), "-m", "pip", "install", "-q", *self.requirements], check=True)
+        self.marker(folder).write_text("\n".join(self.requirements) + "\n")
+
+    def environment(self, folder: Path) -> dict[str, str]:
+        """Variables of its process: one thread, a kernel cache of its own, nothing of our interpreter."""
+        ours = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+        threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
+        return ours | threads | {"WARP_CACHE_PATH": str(folder / self.name / "warp_cache")}
+
+
+# MuJoCo's default contact, a spring with a time constant of 20 ms, and the stiffest that MuJoCo allows at a step of 1 ms,
+# two steps. XPBD's default are 2 iterations.
+STIFF = "0.002 1"
+PEERS = {
+    peer.name: peer
+    for peer in (
+        Peer(
+            "mujoco",
+            ("mujoco==4.0.0",),
+            {
+                "pyramidal": {"cone": "pyramidal"},
+                "elliptic": {"cone": "elliptic"},
+                "elliptic, stiff": {"cone": "elliptic", "solref": STIFF},
+            },
+        ),
+        Peer(
+            "mujoco_warp",
+            ("mujoco-warp==4.0.0", "mujoco==4.0.0", "warp-lang==1.19.0"),
+            {"pyramidal": {"cone": "pyramidal"}, "elliptic": {"cone": "elliptic"}},
+        ),
+        Peer(
+            "newton_xpbd",
+            ("newton==1.8.0", "warp-lang==1.19.0"),
+            {"2 iterations": {"iterations": 2}, "20 iterations": {"iterations": 20}},
+        ),
+    )
+}
+
+
+def split(names: list[str], folder: Path, peers: dict[str, Peer] | None = None) -> tuple[list[Peer], str]:
+    """The installed ones of the named peers, and one line about the others ('' if there are none)."""
+    chosen = [(PEERS if peers is None else peers)[name] for name in names]
+    absent = [peer.name for peer in chosen if not peer.installed(folder)]
+    line = f"peers not installed: {', '.join(absent)} (python -m benchmarks peers install {' '.join(absent)})" if absent else ""
+    return [peer for peer in chosen if peer.name not in absent], line

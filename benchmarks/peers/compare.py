@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ours and the peers on the same scenes: speed side by side, and how far each is from what should have come out.
+
+One core for everyone. After a warm-up the engines take turns, one repetition each, so that a busy minute of the machine meets
+all of them; the ratio is taken turn by turn. Ours is Simulator's default: method auto, float64. A peer counts only if it
+started from the scene's own state, stayed finite and in its memory, and moved in the timed run as in the recorded one; that
+its motion differs from ours is said in the last column and is part of the result.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+import warp_lcp as wl
+
+from .. import scenes
+from ..scenes import Scene
+from . import Peer
+from .session import Session, session
+
+OURS = "warp_lcp, auto float64"
+STILL = ("rest", "stack10")  # scenes that should stay as they start
+FINE_STEP = 1e-4  # s, of the run that 'slide' is compared with
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What an engine did: final pose [E, B, 7], largest height [E, B], mean contacts in an environment and a step."""
+
+    pose: np.ndarray
+    top: np.ndarray
+    contacts: float
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keep this process and those it starts on one core: the last of those it may use, where the system can do that."""
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def record(sim: wl.Simulator, scene: Scene) -> Motion:
+    """Our own motion, step by step and not timed."""
+    sim.reset()
+    top, contacts = np.array(-np.inf), []
+    for _ in range(scene.steps):
+        sim.step()
+        top = np.maximum(top, pose(sim)[..., 2])
+        contacts.append(sim.contacts.count.numpy().mean())
+    return Motion(pose(sim), top, float(np.mean(contacts)))
+
+
+def pose(sim: wl.Simulator) -> np.ndarray:
+    """A copy of [E, B, 7]: a free body's coordinates are its pose."""
+    return np.array(sim.q.numpy()).reshape(sim.num_envs, -1, 7)
+
+
+def reference(scene: Scene) -> np.ndarray | None:
+    """The pose that should have come out, [1 or E, B, 7], where there is one: nothing else than chance says where boxes tumble."""
+    if scene.name in STILL:
+        return scene.pose
+    if scene.name != "slide":
+        return None
+    one = replace(scene, pose=scene.pose[:1], velocity=scene.velocity[:1])  # its environments are alike
+    fine = one.simulator(dt=FINE_STEP, device="cpu")
+    fine.step(round(scene.steps * scene.dt / FINE_STEP))
+    return pose(fine)
+
+
+def penetration(scene: Scene, final: np.ndarray) -> float:
+    """Deepest overlap [m] of anybody's final poses, measured by our collision detection; NaN for poses that are not finite."""
+    if not np.isfinite(final).all():
+        return float("nan")
+    sim = scene.simulator(device="cpu")
+    sim.q0.assign(final.reshape(scene.envs, -1))
+    sim.v0.zero_()
+    sim.reset()
+    sim.step()
+    gap, count = sim.contacts.gap.numpy(), sim.contacts.count.numpy()
+    return max(0.0, -float(np.min(gap, where=np.arange(gap.shape[1]) < count[:, None], initial=0.0)))
+
+
+def errors(scene: Scene, motion: Motion, expected: np.ndarray | None) -> dict[str, float | None]:
+    """Largest distance [m] and turn [rad] from the expected pose, lift over the start [m] where nothing should rise, overlap [m]."""
+    found: dict[str, float | None] = {"distance": None, "angle": None, "lift": None}
+    if expected is not None:
+        found["distance"] = float(np.linalg.norm(motion.pose[..., :3] - expected[..., :3], axis=-1).max())
+        cosine = np.abs(np.sum(motion.pose[..., 3:] * expected[..., 3:], axis=-1)) / np.linalg.norm(motion.pose[..., 3:], axis=-1)
+        found["angle"] = float(2.0 * np.arccos(np.minimum(cosine, 1.0)).max())
+        found["lift"] = max(0.0, float((motion.top - scene.pose[..., 2]).max()))
+    return found | {"penetration": penetration(scene, motion.pose)}
+
+
+def problems(scene: Scene, done: Session) -> list[str]:
+    """Why a peer's timings do not count: it did not simulate this scene, or not the same every time."""
+    arrays, found = done.arrays, []
+    for name, ours in (("pose", scene.pose), ("velocity", scene.velocity)):
+        start = arrays[f"start_{name}"]
+        if start.shape != ours.shape or not np.allclose(start, ours, rtol=0.0, atol=1e-5):
+            found.append(f"another start {name}")
+    if arrays["pose"].shape != scene.pose.shape or not all(np.isfinite(a).all() for a in arrays.values()):
+        found.append("final state not finite")
+    elif not np.array_equal(arrays["pose"], arrays["recorded_pose"]):
+        found.append("timed and recorded runs differ")
+    if done.answer["info"]["overflow"]:
+        found.append("contacts or rows overflowed")
+    return found
+
+
+def remarks(scene: Scene, motion: Motion, ours: Motion) -> list[str]:
+    """How a peer's motion differs from ours so far that its speed is that of another task."""
+    found = []
+    if motion.contacts < 0.5 * ours.contacts:
+        found.append(f"touches {motion.contacts / ours.contacts:.0%} as often as ours")
+    moved, expected = (np.linalg.norm((m.pose - scene.pose)[..., :2], axis=-1).mean() for m in (motion, ours))
+    if scene.name == "slide" and abs(moved / expected - 1.0) > 0.1:
+        found.append(f"moved {moved:.3f} m, ours {expected:.3f} m")
+    if motion.pose[..., 2].min() < 0.5 * scene.half.min():
+        found.append("a box is in the floor")
+    return found
+
+
+def one(scene: Scene, peers: list[Peer], repetitions: int, folder: Path) -> list[dict[str, Any]]:
+    """Ours and every variant of every peer on one scene."""
+    sim = scene.simulator(device="cpu")
+    sim.step(2)
+    seconds: list[float] = []
+    status = np.zeros(scene.envs, dtype=np.int32)
+    with ExitStack() as stack:
+        running = [stack.enter_context(session(peer, variant, scene, repetitions, folder)) for peer in peers for variant in peer.variants]
+        for _ in range(repetitions):
+            sim.reset()
+            begin = time.perf_counter()
+            sim.step(scene.steps)
+            seconds.append(time.perf_counter() - begin)
+            status |= sim.status.numpy()
+            for each in running:
+                each.repeat()
+        for each in running:
+            each.finish()
+        ours, expected = record(sim, scene), reference(scene)
+        rows = [row(scene, OURS, seconds, seconds) | errors(scene, ours, expected)]
+        rows[0] |= {"contacts": ours.contacts, "marked_envs": int(np.count_nonzero(status)), "problems": [], "remarks": []}
+        for each in running:
+            motion = Motion(each.arrays["pose"], each.arrays["top"], float(each.arrays["contacts"]))
+            line = row(scene, each.name, each.answer["seconds"], seconds) | errors(scene, motion, expected)
+            line |= {"contacts": motion.contacts, "problems": problems(scene, each), "remarks": remarks(scene, motion, ours)}
+            line |= {"settings": each.peer.variants[each.variant], "info": each.answer["info"], "versions": each.answer["versions"]}
+            rows.append(line)
+    return rows
+
+
+def row(scene: Scene, engine: str, seconds: list[float], ours: list[float]) -> dict[str, Any]:
+    """Speed of an engine, and of ours over it, turn by turn."""
+    work, ratios = scene.envs * scene.steps, [theirs / mine for theirs, mine in zip(seconds, ours, strict=True)]
+    rates = [work / s for s in seconds]
+    return {
+        "scene": scene.name,
+        "envs": scene.envs,
+        "steps": scene.steps,
+        "dt": scene.dt,
+        "engine": engine,
+        "seconds": seconds,
+        "env_steps_per_s": statistics.median(rates),
+        "spread": (max(rates) - min(rates)) / statistics.median(rates),
+        "ours_over_peer": statistics.median(ratios),
+        "ours_over_peer_range": [min(ratios), max(ratios)],
+    }
+
+
+def measure(peers: list[Peer], quick: bool, folder: Path) -> list[dict[str, Any]]:
+    """Every scene with every peer."""
+    with one_core():
+        return [
+            r for name in tqdm(scenes.STEPS, desc="peers", disable=None) for r in one(scenes.scene(name), peers, 5 if quick else 7, folder)
+        ]
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """One line for each engine and scene; lengths in mm, angles in mrad."""
+
+    def thousandths(value: float | None) -> str:
+        return "-" if value is None else f"{1e3 * value:.2g}" if abs(value) < 0.1 else f"{1e3 * value:.0f}"
+
+    lines = [
+        "| scene | engine | env-steps/s | ours / it (least to most) | contacts | error mm | error mrad | lift mm | overlap mm | remarks |",
+        "|" + " --- |" * 10,
+    ]
+    for r in rows:
+        low, high = r["ours_over_peer_range"]
+        ratio = "-" if r["problems"] or r["engine"] == OURS else f"{r['ours_over_peer']:.2f} ({low:.2f} to {high:.2f})"
+        errors = " | ".join(thousandths(r[key]) for key in ("distance", "angle", "lift", "penetration"))
+        said = "; ".join([f"NOT COMPARED: {p}" for p in r["problems"]] + r["remarks"])
+        lines.append(
+            f"| {r['scene']}, {r['envs']} envs | {r['engine']} | {r['env_steps_per_s']:,.0f} ± {50 * r['spread']:.0f} % "
+            f"| {ratio} | {r['contacts']:.1f} | {errors} | {said} |"
+        )
+    return "\n".join(lines)
