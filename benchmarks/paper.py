@@ -21,13 +21,13 @@ from warp_lcp.laws import Law
 from warp_lcp.methods import LCP_METHODS
 
 from . import lead_matrix as lead
-from .speed import box
+from .scenes import GRAVITY, scene
 
 DOCS = Path(__file__).parents[1] / "docs"
 BEGIN, END = "<!-- tables of `python -m benchmarks paper` -->\n", "<!-- end of the tables -->\n"
 DURATION = 0.8  # s; the continuous motion rests at 0.661 s
 STIFFNESS = 1e10  # N/m, k_n
-GRAVITY, MU, INERTIA, HALF, SPEED, SPIN = 9.81, 1.0, 1.0 / 6.0, 0.5, 5.0, 2.0 * np.pi  # of the box, m = 1 kg
+MU, INERTIA, HALF, SPEED, SPIN = 1.0, 1.0 / 6.0, 0.5, 5.0, 2.0 * np.pi  # of the box, m = 1 kg
 METHODS = ("auto", "lemke", "judice_pires", "murty", "velocity_pivoting", "proximal_newton", "pgs")
 HEADINGS = np.linspace(0.0, np.pi / 2, 16, endpoint=False)
 #: Rest pose (x, y [m], yaw [rad]) of an exact-cone stepper that is not ours (Siconos, normals relaxed as here) less the continuous
@@ -47,7 +47,7 @@ class Case:
 
     def simulator(self, h: float, device: Any, envs: int = 1, method: str = "auto", rho_scale: float = 1.0) -> wl.Simulator:
         options = {"sliding": self.sliding, "directions": self.directions, "rho_scale": rho_scale}
-        return wl.Simulator(box(), envs, h, self.formulation, method, device=device, **options)
+        return wl.Simulator(scene("slide", 1).model(), envs, h, self.formulation, method, device=device, **options)
 
     def takes(self, method: str) -> bool:
         """Is the method made for this law?"""
