@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `python -m benchmarks paper` rests on: its continuous reference, its lead matrices and its plain pivoting."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from conftest import DEVICE
 
 from benchmarks import lead_matrix as lead
-from benchmarks import paper
+from benchmarks import paper, paper_picture
 
+ROOT = Path(__file__).parents[1]
 CASES = {case.name: case for case in (*paper.CASES, *paper.PIVOTED)}
 
 
@@ -105,3 +109,27 @@ def test_tables_go_between_their_marks(tmp_path):
     path.write_text("no marks\n")
     with pytest.raises(ValueError, match="marks"):
         paper.document("new", path)
+
+
+def results():
+    """What the tables and the picture in docs were made of."""
+    return json.loads(sorted((ROOT / "benchmarks" / "results").glob("*-paper-cpu.json"))[-1].read_text())
+
+
+def test_the_document_holds_the_tables_of_the_results():
+    tables = (ROOT / "docs" / "paper.md").read_text().partition(paper.BEGIN)[2].partition(paper.END)[0]
+    assert tables == f"\n{paper.markdown(results())}\n"
+
+
+def test_the_picture_is_that_of_the_results(tmp_path):
+    """The same data give the same file, other data another."""
+    pytest.importorskip("matplotlib")
+    data = results()
+    for name in ("a", "b"):
+        paper_picture.draw(data, tmp_path / name)
+    first, second = (tmp_path / f"{name}.svg" for name in ("a", "b"))
+    assert first.read_bytes() == second.read_bytes()
+    assert (tmp_path / "a.png").stat().st_size > 50_000
+    data["formulations"][0]["trajectory"][-1][0] += 0.1
+    paper_picture.draw(data, tmp_path / "b")
+    assert first.read_bytes() != second.read_bytes()
