@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks speed|resources|lcp|paper|peers [--help]"""
+"""python -m benchmarks speed|robust|resources|lcp|paper|peers [--help]"""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from . import lcp, paper, paper_picture, peers, report, resources, speed
+from . import lcp, paper, paper_picture, peers, report, resources, robust, speed
 from .peers import compare
 
 
@@ -40,6 +40,12 @@ def arguments() -> argparse.Namespace:
     )
     recorded = commands.add_parser("lcp", parents=[out, quick], help="every method for LCPs on recorded problems")
     recorded.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
+    crowd = commands.add_parser("robust", parents=[out], help="randomised environments of every shipped scene: what is certified")
+    crowd.add_argument("--scenes", type=lambda text: text.split(","), default=robust.scenes(), metavar="NAME,...", help="default: all")
+    crowd.add_argument("--formulations", type=lambda text: text.split(","), default=["phantom_inertia", "coulomb"], metavar="NAME,...")
+    crowd.add_argument("--envs", type=int, default=4096, help="environments of each scene (default 4096)")
+    crowd.add_argument("--seconds", type=float, default=10.0, help="simulated time (default 10)")
+    crowd.add_argument("--device", default=None, help="Warp device (default: Warp's)")
     commands.add_parser("resources", parents=[out], help="what the kernels take of a GPU")
     comparison = commands.add_parser("paper", parents=[quick], help="the paper's own comparison: formulations, lead matrices, Fig. 4")
     comparison.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
@@ -79,7 +85,7 @@ def main() -> None:
             peers.PEERS[name].install(asked.dir)
             print(f"{name}: installed in {asked.dir / name}")
         return
-    device = wp.get_device(asked.device if asked.what == "speed" else "cpu" if asked.what == "peers" else None)
+    device = wp.get_device("cpu" if asked.what == "peers" else getattr(asked, "device", None))
     if asked.what == "speed":
         rows = speed.measure(device, quick=asked.quick)
         start = speed.start_up()
@@ -101,6 +107,10 @@ def main() -> None:
                 asked.out.mkdir(parents=True, exist_ok=True)
             paper_picture.draw(data, (asked.out or paper.DOCS) / "paper_comparison")
         asked.out = asked.out or Path("benchmarks/results")
+    elif asked.what == "robust":
+        rows = robust.measure(device, asked.scenes, asked.formulations, asked.envs, asked.seconds)
+        print(robust.markdown(rows))
+        data = {"rows": rows}
     elif asked.what == "lcp":
         try:
             rows = lcp.measure(device, asked.problems, quick=asked.quick)

@@ -39,7 +39,7 @@ class Resources:
 def scenes() -> list[wl.Model]:
     """A scene with one movable body, and one in which every pair of shapes can meet."""
     single, many = wl.ModelBuilder(), wl.ModelBuilder()
-    single.add_plane()
+    single.add_plane(material=wl.Material(restitution=0.5))
     single.add_box(single.add_body(), (0.1, 0.1, 0.1))
     many.add_plane()
     for _ in range(2):

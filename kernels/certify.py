@@ -56,6 +56,10 @@ def make(real):
         next_velocity: wp.array2d(dtype=spatial),
         contacts: Contacts,
         slots: Slots,
+        todo: wp.array(dtype=int),
+        number: wp.array(dtype=int),
+        left: wp.array(dtype=int),
+        number_left: wp.array(dtype=int),
         unsolved: wp.array(dtype=int),
         reason: wp.array(dtype=int),
         best_residual: wp.array(dtype=real),
@@ -64,10 +68,10 @@ def make(real):
         status: wp.array(dtype=int),
         stride: int,
     ):
+        """The answers of the environments todo[:number]; those that the next method is to solve go to `left`."""
         start, _ = wp.tid()
-        for env in range(start, contacts.count.shape[0], stride):
-            if unsolved[env] == 0:
-                continue
+        for index in range(start, number[0], stride):
+            env = todo[index]
             r = contacts.count[env]
             worst = real(0.0)
             energy = real(0.0)
@@ -140,9 +144,12 @@ def make(real):
             residual[env] = worst
             residual_energy[env] = energy
             solved = worst <= tolerance
+            unsolved[env] = 1
             if solved:
                 unsolved[env] = 0
-            elif final != 0:
+            elif final == 0:
+                left[wp.atomic_add(number_left, 0, 1)] = env  # in any order: environments know nothing of each other
+            else:
                 if finite:
                     status[env] = status[env] | reason[env] | UNCERTIFIED
                 else:

@@ -234,7 +234,8 @@ def make_contacts(real):
     def proximal_contacts(
         bodies: Bodies,
         contacts: Contacts,
-        unsolved: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        number: wp.array(dtype=int),
         sweeps: int,
         limit: int,
         target: real,
@@ -245,9 +246,10 @@ def make_contacts(real):
         reason: wp.array(dtype=int),
     ):
         slot, lane = wp.tid()
-        for env in range(slot, contacts.count.shape[0], c.free.shape[0]):
+        for index in range(slot, number[0], c.free.shape[0]):
+            env = todo[index]
             n = contacts.count[env]
-            if unsolved[env] == 0 or n == 0:
+            if n == 0:
                 continue
             couple(g, slot, n, contacts.body, bodies.inv_mass, env, lane)
             if analyse(g, slot, n, lane):

@@ -318,7 +318,8 @@ def make(real, method: str, generators: bool = False):
     def assembled_lcp(
         bodies: Bodies,
         contacts: Contacts,
-        unsolved: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        number: wp.array(dtype=int),
         rho_scale: real,
         lcp: LcpWorkspace,
         ws: ContactWorkspace,
@@ -326,11 +327,12 @@ def make(real, method: str, generators: bool = False):
         reason: wp.array(dtype=int),
     ):
         slot, lane = wp.tid()
-        for env in range(slot, contacts.count.shape[0], lcp.q.shape[0]):
+        for index in range(slot, number[0], lcp.q.shape[0]):
+            env = todo[index]
             if contacts.count[env] > ws.friction.shape[1] - 1:  # more contacts than the workspace was made for
-                if lane == 0 and unsolved[env] != 0:
+                if lane == 0:
                     reason[env] = reason[env] | ITERATION_LIMIT
-            elif unsolved[env] != 0 and contacts.count[env] > 0:
+            elif contacts.count[env] > 0:
                 n = int(0)
                 if wp.static(generators):
                     n = assemble_generators(lcp, ws, bodies, contacts, env, slot, lane)

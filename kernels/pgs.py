@@ -46,7 +46,8 @@ def make(real):
     def pgs(
         bodies: Bodies,
         contacts: Contacts,
-        unsolved: wp.array(dtype=int),
+        todo: wp.array(dtype=int),
+        number: wp.array(dtype=int),
         sweeps: int,
         tolerance: real,
         velocity: wp.array2d(dtype=spatial),
@@ -55,9 +56,8 @@ def make(real):
         stride: int,
     ):
         start, _ = wp.tid()
-        for env in range(start, contacts.count.shape[0], stride):
-            if unsolved[env] == 0:
-                continue
+        for index in range(start, number[0], stride):
+            env = todo[index]
             r = contacts.count[env]
             for b in range(velocity.shape[1]):
                 velocity[env, b] = bodies.free_velocity[env, b]

@@ -295,13 +295,16 @@ def make_single(real, cone: bool, frozen: bool):
         bodies: Bodies,
         body: int,
         contacts: Contacts,
+        todo: wp.array(dtype=int),
+        number: wp.array(dtype=int),
         limit: int,
         tolerance: real,
         iterations: wp.array(dtype=int),
         stride: int,
     ):
         start, _ = wp.tid()
-        for env in range(start, contacts.count.shape[0], stride):
+        for index in range(start, number[0], stride):
+            env = todo[index]
             r = contacts.count[env]
             if r == 0:
                 continue
@@ -552,6 +555,8 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
     def pivot(
         bodies: Bodies,
         contacts: Contacts,
+        todo: wp.array(dtype=int),
+        number: wp.array(dtype=int),
         g: Graph,
         ws: Workspace,
         limit: int,
@@ -560,7 +565,8 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
     ):
         slot, lane = wp.tid()
         n = ws.body.shape[0]
-        for env in range(slot, contacts.count.shape[0], ws.flips.shape[0]):
+        for index in range(slot, number[0], ws.flips.shape[0]):
+            env = todo[index]
             r = contacts.count[env]
             flips = r
             solves = int(0)

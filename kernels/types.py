@@ -28,6 +28,7 @@ RAY = wp.constant(2)
 NOT_A_NUMBER = wp.constant(4)
 OVERFLOW = wp.constant(8)
 UNCERTIFIED = wp.constant(16)
+RESTITUTION_REDUCED = wp.constant(32)
 
 # Admissible friction of Coulomb's cone (Contacts.directions, kernels/friction.py).
 DISC = wp.constant(1)

@@ -35,6 +35,24 @@ def test_sphere_slip_roll():
     assert run("sphere_slip_roll", 0.4).v.numpy()[0, 0] == pytest.approx(10 / 7, rel=1e-6)
 
 
+def test_bouncing_balls():
+    """Highest point after the first bounce e^2 m, within what an impact in the middle of a step makes: (1 - e^2) h V and less.
+
+    e = 1 comes back to 1 m, but for eps m and the sampling, 0.05 mm; e = 0 stays down.
+    """
+    h, e = 1e-3, np.array([0, 0.25, 0.5, 0.75, 0.9, 1.0])
+    sim = simulator(wl.load_usd("bouncing_balls"), dt=h)
+    run = sim.rollout(1200, record=("body_pose", "status"))
+    assert (run.status.numpy() == 0).all()
+    pose = run.body_pose.numpy()[:, 0]
+    peaks = pose[460:, :, 2].max(0) - 0.1
+    step = h * np.sqrt(2 * G)
+    assert (peaks > e**2 - 1e-4).all()
+    assert (peaks < e**2 + (1 - e**2 + e * (1 - e) / 2) * step + 1e-9).all()
+    assert np.abs(pose[:, :, 0] - 0.5 * np.arange(6)).max() < 1e-12
+    assert np.abs(pose[:, :, 1]).max() < 1e-12
+
+
 def test_incline():
     """tan = 0.6: the block with mu = 0.5 slides at g (sin - mu cos), the other stays."""
     sim = run("incline", 0.5)

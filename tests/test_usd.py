@@ -410,9 +410,16 @@ def test_static_friction_below_dynamic_takes_the_larger():
     assert any("/M: dynamicFriction 0.3 exceeds staticFriction 0" in n for n in model.report.notes)
 
 
-def test_restitution_is_reported():
-    ignored = load(material("float physics:restitution = 0.8;"), body(inner=bound_cube())).report.ignored
-    assert [(i.path, i.what, i.why) for i in ignored] == [("/M", "physics:restitution = 0.8", "restitution is not simulated yet")]
+def test_restitution_is_read():
+    """A collider without a material has none."""
+    model = load(material("float physics:restitution = 0.8;"), body(inner=bound_cube()), cube("Ground"))
+    assert dict(zip(model.shape_names, model.restitution, strict=True)) == {"/B/C": 0.8, "/Ground": 0.0}
+    assert model.report.ignored == ()
+
+
+def test_restitution_above_one_is_refused():
+    with pytest.raises(wl.WarpLcpError, match=r"/B/C.*restitution is 1.5; it must be at most 1"):
+        load(material("float physics:restitution = 1.5;"), body(inner=bound_cube()))
 
 
 def test_contact_parameters_in_stage_units():
@@ -575,7 +582,7 @@ def test_attributes_without_their_schema_are_reported():
         ("no/such/thing.usda", ["no/such/thing.usda: no such file", "check the path"]),
         ("box_on_grond", ["box_on_grond: no file and no shipped scene", "did you mean the shipped scene 'box_on_ground'?", "stack"]),
         ("box_on_ground.usd", ["no such file", "'box_on_ground'"]),
-        (Path("zzz"), ["zzz: no file and no shipped scene", "shipped: belt, box_on_ground"]),
+        (Path("zzz"), ["zzz: no file and no shipped scene", "shipped: belt, bouncing_balls"]),
         (7, ["a scene is a path", "not int"]),
     ],
 )
@@ -649,7 +656,7 @@ def test_every_shipped_scene_says_what_it_shows_and_loads_without_remarks():
     from pxr import Sdf
 
     boxes_and_balls = {"belt", "box_on_ground", "heavy_on_light", "incline", "spinning_box", "sphere_slip_roll", "stack"}
-    assert set(scenes.names()) == {"launch_fan", "pile", "plate_many_contacts", *boxes_and_balls}
+    assert set(scenes.names()) == {"bouncing_balls", "launch_fan", "pile", "plate_many_contacts", *boxes_and_balls}
     for name in scenes.names():
         root = Sdf.Layer.FindOrOpen(str(scenes.path(name)))
         assert "Expected:" in root.documentation

@@ -190,7 +190,7 @@ class ModelBuilder:
             half_extents: [3] m.
             pose: in the owner's frame.
             name: 'shape<i>' if omitted.
-            material: friction and contact stiffness.
+            material: friction, restitution and contact stiffness.
             density: [kg/m^3], used where the body gives no mass.
             surface_velocity: [3] m/s in the shape's frame, of the surface relative to the body: a belt.
         """
@@ -261,6 +261,7 @@ class ModelBuilder:
             shape_surface_velocity=np.array([s.surface_velocity for s in shapes], dtype=float).reshape(-1, 3),
             friction=np.array([(s.material.static_friction, s.material.dynamic_friction) for s in shapes], dtype=float).reshape(-1, 2),
             contact=np.array([[getattr(s.material, f) for f in CONTACT_FIELDS] for s in shapes], dtype=float).reshape(-1, 5),
+            restitution=np.array([s.material.restitution for s in shapes], dtype=float),
             pairs=self._pairs(),
             gravity=self.gravity.copy(),
             up_axis=self.up_axis,
@@ -350,6 +351,8 @@ def _check_material(name: str, material: Material) -> None:
         strict = f.name in CONTACT_FIELDS and f.name != "tangent_stiffness" and f.name != "normal_stiffness"
         if not np.isfinite(value) or value < 0.0 or (strict and value == 0.0):
             raise ModelError(f"{name}: {f.name} is {value}; it must be finite and {'greater than' if strict else 'at least'} zero")
+    if material.restitution > 1.0:
+        raise ModelError(f"{name}: restitution is {material.restitution}; it must be at most 1, more would make energy")
     if material.dynamic_friction > material.static_friction:
         raise ModelError(
             f"{name}: dynamic friction {material.dynamic_friction} exceeds static friction {material.static_friction}; "

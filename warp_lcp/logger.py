@@ -40,7 +40,7 @@ import warp as wp
 from .errors import MissingExtra, WarpLcpError
 from .kernels.watch import collect_status
 from .model import JointType, Model, ShapeType
-from .simulator import Simulator, Status
+from .simulator import INFORMATIVE, Simulator, Status
 
 #: Environments logged unless asked for otherwise: disk and viewer, not the simulator, set this limit.
 DEFAULT_ENVS = 64
@@ -54,15 +54,13 @@ STATIC_COLOR = (88, 95, 105)
 #: By contact state: open, stick, slide.
 STATE_COLORS = np.array([(150, 150, 150), (60, 210, 100), (255, 70, 60)], dtype=np.uint8)
 STATUS_BITS = tuple(bit for bit in Status if bit)
+STATUS_COLORS = ((240, 190, 90), (255, 140, 60), (255, 60, 60), (190, 120, 230), (120, 170, 255), (120, 200, 140))
 SERIES: dict[str, tuple[tuple[str, tuple[int, int, int]], ...]] = {
     "plots/residual": (("worst", (255, 110, 90)), ("99 %", (120, 170, 255))),
     "plots/iterations": (("iterations, mean", (120, 170, 255)), ("iterations, most", (60, 90, 160))),
     "plots/contacts": (("contacts, mean", (240, 190, 90)), ("contacts, most", (150, 110, 40))),
     "plots/energy": (("mean", (120, 210, 130)), ("least", (70, 110, 80)), ("most", (180, 240, 120))),
-    "plots/status": tuple(
-        (str(bit.name).lower(), color)
-        for bit, color in zip(STATUS_BITS, ((240, 190, 90), (255, 140, 60), (255, 60, 60), (190, 120, 230), (120, 170, 255)), strict=True)
-    ),
+    "plots/status": tuple((str(bit.name).lower(), color) for bit, color in zip(STATUS_BITS, STATUS_COLORS, strict=True)),
 }
 
 
@@ -262,6 +260,7 @@ class RerunLogger:
 
     def _warn(self, seen: np.ndarray, residual: np.ndarray, most: int = 20) -> None:
         """One line for each environment that is not OK for the first time, ``most`` lines in a frame."""
+        seen = seen & ~INFORMATIVE
         new = np.flatnonzero((seen != 0) & ~self._warned)
         self._warned[new] = True
         for env in new[:most]:

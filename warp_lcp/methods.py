@@ -2,7 +2,7 @@
 """Solution methods of the contact problem. A method sees one problem, the rows of every environment, and leaves impulses.
 
 A new method is a class with ``kernel`` (chosen for a model), ``prepare`` (allocate, once) and ``launch`` (record, no host
-read-back), entered in METHODS.
+read-back, for the environments todo[:number] that are listed on the device), entered in METHODS.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ class AssembledLCP:
         self.contacts = ws
         self.slots = slots
 
-    def launch(self, sim: Simulator) -> None:
-        inputs = [sim.bodies, sim.rows, sim.unsolved, sim.rho_scale, self.lcp, self.contacts, sim.iterations, sim.reason]
+    def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
+        inputs = [sim.bodies, sim.rows, todo, number, sim.rho_scale, self.lcp, self.contacts, sim.iterations, sim.reason]
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
@@ -129,9 +129,9 @@ class ProximalNewton:
         self.slots = workspaces(sim.num_envs, 10 * blocks + 20 * fill, sim.device)
         self.workspace = contact_workspace(sim.real, self.slots, n, blocks, fill, sim.device)
 
-    def launch(self, sim: Simulator) -> None:
+    def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
         accuracy = (1e-12, 1e-6) if sim.real is wp.float64 else (1e-6, 1e-2)  # of velocities, of impulses; relative
-        inputs = [sim.bodies, sim.rows, sim.unsolved, self.SWEEPS, self.LIMIT, *accuracy, *self.workspace, sim.iterations, sim.reason]
+        inputs = [sim.bodies, sim.rows, todo, number, self.SWEEPS, self.LIMIT, *accuracy, *self.workspace, sim.iterations, sim.reason]
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
@@ -173,12 +173,12 @@ class VelocityPivoting:
             setattr(ws, name, wp.empty((self.slots, max(width, 1)), dtype=dtype, device=sim.device))
         ws.flips = wp.zeros(self.slots, dtype=int, device=sim.device)
 
-    def launch(self, sim: Simulator) -> None:
+    def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
         tail = [self.LIMIT, sim.sign_tolerance, sim.iterations]
         if self.single:
-            sim.launch(self.kernel, [sim.bodies, int(self.movable[0]), sim.rows, *tail])
+            sim.launch(self.kernel, [sim.bodies, int(self.movable[0]), sim.rows, todo, number, *tail])
         else:
-            inputs = [sim.bodies, sim.rows, self.graph, self.workspace, *tail]
+            inputs = [sim.bodies, sim.rows, todo, number, self.graph, self.workspace, *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
@@ -193,11 +193,11 @@ class BlockPGS:
     def prepare(self, sim: Simulator) -> None:
         """Nothing to allocate: the velocities are the simulator's."""
 
-    def launch(self, sim: Simulator) -> None:
+    def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
         # Sweeps end where no impulse changes a velocity by more than a hundredth of what certifies an answer.
         sim.launch(
             self.kernel,
-            [sim.bodies, sim.rows, sim.unsolved, self.SWEEPS, 0.01 * sim.tolerance, sim.next_velocity, sim.iterations, sim.reason],
+            [sim.bodies, sim.rows, todo, number, self.SWEEPS, 0.01 * sim.tolerance, sim.next_velocity, sim.iterations, sim.reason],
         )
 
 

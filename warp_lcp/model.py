@@ -76,6 +76,7 @@ class Material:
         tangent_stiffness: k_t [N/m] of the bristles; None as above.
         tangent_damping: b_t [N s/m] of the bristles; None as above.
         slip_threshold: v_s [m/s], the speed from which a contact counts as sliding; None takes Table 1.
+        restitution: e, normal speed after an impact over that before it (Newton), 0 to 1; averaged like friction.
     """
 
     static_friction: float = 0.5
@@ -85,6 +86,7 @@ class Material:
     tangent_stiffness: float | None = None
     tangent_damping: float | None = None
     slip_threshold: float | None = None
+    restitution: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,7 @@ class Model:
         shape_surface_velocity: [S, 3] m/s in the shape's frame, velocity of the surface relative to the body (belts).
         friction: [S, 2] static and dynamic coefficient.
         contact: [S, 5] k_n, b_n, k_t, b_t, v_s; NaN where the defaults of Table 1 apply.
+        restitution: [S] Newton's e of each material; a pair has the average.
         pairs: [P, 2] shapes that may touch, grouped by kind, the lower ShapeType first.
         gravity: [3] m/s^2.
         up_axis: 'Y' or 'Z', for viewers.
@@ -161,6 +164,7 @@ class Model:
     shape_surface_velocity: np.ndarray
     friction: np.ndarray
     contact: np.ndarray
+    restitution: np.ndarray
     pairs: np.ndarray
     gravity: np.ndarray
     up_axis: str = "Z"

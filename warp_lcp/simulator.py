@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from .errors import SimulationError, WarpLcpError
-from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset
+from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset, restitution
 from .kernels.types import scalar_types
 from .laws import Law
 from .methods import METHODS, chosen
@@ -29,6 +29,7 @@ PARAMETERS = {
     "com": "it must be finite",
     "friction": "it must be finite and not negative, and mu_k no larger than mu_s",
     "contact": "it must be finite and not negative (damping and slip threshold greater than zero), or NaN for Table 1",
+    "restitution": "it must be at least 0 and at most 1",
     "gravity": "it must be finite",
 }
 #: Largest residual [m/s] of an answer that counts as solved.
@@ -44,6 +45,11 @@ class Status(enum.IntFlag):
     NOT_A_NUMBER = 4  #: the state holds a NaN or an infinity
     OVERFLOW = 8  #: more contacts than Model.max_contacts; those that came last were dropped
     UNCERTIFIED = 16  #: the answer's residual exceeds 1e-6 m/s; it was applied all the same
+    RESTITUTION_REDUCED = 32  #: nothing failed: an impact gave back less than e, for all of it would have raised the energy
+
+
+#: Status bits that say something about an answer and nothing against it.
+INFORMATIVE = Status.RESTITUTION_REDUCED
 
 
 @dataclass(frozen=True)
@@ -91,7 +97,8 @@ class Simulator:
         integrator: 'euler', q+ = q + h Gamma v+ (eq. 23), or 'midpoint', q+ = q + h Gamma (v + v+) / 2 but for bodies that
             this would drive into others: second order away from impacts.
         device: Warp device; None = Warp's default.
-        strict: raise after a step in which an environment's status is not OK (reads the status back every time).
+        strict: raise after a step in which an environment's status is not OK (reads the status back every time);
+            RESTITUTION_REDUCED alone does not count.
 
     Attributes:
         q, v: [E, nq], [E, nv] state, writable in place.
@@ -147,6 +154,8 @@ class Simulator:
         self._load_kernels()
         self._graphs: dict[str, Any] = {}
         self._combine_pairs()
+        self.bounces: Any = None
+        self._set_restitution(model.restitution[None])
         self._recorder: Recorder | None = None
         self.time = 0.0
         self.last_count = 0
@@ -219,10 +228,12 @@ class Simulator:
 
         Each value has the shape of the Model's field, or that with num_envs in front: ``mass`` [B], ``inertia``
         [B, 3, 3] about the centre of mass in body axes, ``com`` [B, 3], ``friction`` [S, 2] (static, dynamic),
-        ``contact`` [S, 5] (k_n, b_n, k_t, b_t, v_s; NaN = Table 1 scaled with the mass) and ``gravity`` [3]. SI units.
+        ``contact`` [S, 5] (k_n, b_n, k_t, b_t, v_s; NaN = Table 1 scaled with the mass), ``restitution`` [S] and ``gravity``
+        [3]. SI units.
 
         What follows from a parameter follows at once: inverse masses, the scaling of Table 1, the coefficients of a
         pair. ``mass`` without ``inertia`` is a body of the same shape and another density: its inertia scales along.
+        Where the model has no restitution, the first one above zero loads the kernels that it needs.
 
         Raises:
             WarpLcpError: for an unknown name, a wrong shape, or a number that no body or contact can have.
@@ -231,13 +242,10 @@ class Simulator:
         if "mass" in checked and "inertia" not in checked:
             inertia, mass = self.parameters.inertia.numpy(), self.parameters.mass.numpy()
             checked["inertia"] = inertia * (checked["mass"] / mass)[..., None, None]
+        if "restitution" in checked:
+            self._set_restitution(checked.pop("restitution"))
         for name, value in checked.items():
-            present = getattr(self.parameters, name)
-            if present.shape[0] == value.shape[0]:
-                present.assign(value.astype(self._numpy_real))
-            else:
-                setattr(self.parameters, name, self._constant(value, present.dtype))
-                self._graphs.clear()  # they hold the address of the old array
+            self._set_constant(self.parameters, name, value)
         self._combine_pairs()
 
     def _combine_pairs(self) -> None:
@@ -249,6 +257,36 @@ class Simulator:
             p.pair_contact = wp.empty((rows, pairs), dtype=t.vec5, device=self.device)
             self._graphs.clear()
         wp.launch(self._kernels.combine_pairs, dim=(rows, pairs), inputs=[self.topology, p], device=self.device)
+
+    def _set_constant(self, bundle: Any, name: str, value: np.ndarray) -> None:
+        present = getattr(bundle, name)
+        if present.shape[0] == value.shape[0]:
+            present.assign(value.astype(self._numpy_real))
+        else:
+            setattr(bundle, name, self._constant(value, present.dtype))
+            self._graphs.clear()  # they hold the address of the old array
+
+    def _set_restitution(self, value: np.ndarray) -> None:
+        """[1|E, S] e of the shapes. While all are zero, and always were, nothing of restitution exists."""
+        if self.bounces is not None:
+            self._set_constant(self.bounces, "coefficient", value)
+        elif value.any():
+            k = restitution.make(self.real)
+            self._kernels.bounce, self._kernels.judge, self._kernels.settle = k.bounce, k.judge, k.settle
+            bounces = self.bounces = k.Bounces()
+            bounces.coefficient = self._constant(value, self.real)
+            bounces.kick, bounces.before = (
+                self._array(self.model.max_contacts, self.real),
+                self._array(self.model.max_contacts, self._types.vec3),
+            )
+            layout = {self.real: ("theta", "slack", "allowed"), self._types.vec2: ("low", "high"), int: ("stage", "status", "todo")}
+            for dtype, names in layout.items():
+                for name in names:
+                    setattr(bounces, name, wp.zeros(self.num_envs, dtype=dtype, device=self.device))
+            bounces.again = wp.zeros(1, dtype=int, device=self.device)
+            if k.bounce not in self.kernels:
+                self._load([k.bounce, k.judge, k.settle])
+            self._graphs.clear()
 
     def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
         if name not in PARAMETERS:
@@ -262,6 +300,8 @@ class Simulator:
         allowed: np.ndarray = np.isfinite(array) | (np.isnan(array) & (name == "contact"))
         if name == "mass":
             allowed &= array > 0.0
+        elif name == "restitution":
+            allowed &= (array >= 0.0) & (array <= 1.0)
         elif name == "friction":
             allowed &= array >= 0.0
             allowed[..., 1] &= array[..., 1] <= array[..., 0]
@@ -300,7 +340,7 @@ class Simulator:
         return Contacts(r.count, r.body, r.point, r.gap, r.frame, r.impulse, r.velocity, r.state)
 
     def _raise_for_status(self) -> None:
-        status = self.status.numpy()
+        status = self.status.numpy() & ~INFORMATIVE
         bad = np.flatnonzero(status)
         if len(bad):
             what = " | ".join(bit.name or "" for bit in Status if bit and status[bad[0]] & bit)
@@ -316,23 +356,63 @@ class Simulator:
         self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
         for kernel, first, number in self._pair_kernels:
             self.launch(kernel, [self.topology, self.bodies, first, h, self.slots], number)
-        self.unsolved.fill_(1)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
         rows = [*scene, self.bodies, self.slots, h, *self.law.row_arguments, self.rows]
         self.launch(k.contact_rows, rows, self.model.max_contacts)
-        for i, method in enumerate(self._methods):
-            method.launch(self)
-            final = int(i + 1 == len(self._methods))
-            answer = [self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, self.status]
-            problem = [self.bodies, h, self.tolerance, i, final, self.next_velocity, self.rows, self.slots]
-            self.launch(k.certify, [*problem, *answer])
+        if self.bounces is not None:
+            self.launch(
+                k.bounce, [*scene, h, self.tolerance, int(self.integrator == "midpoint"), self.rows, self.bounces], self.model.max_contacts
+            )
+        self._solve_kernels(self.everyone, self.num_everyone, self.status)
+        if self.bounces is not None:
+            self._judge_kernels()
         if self.integrator == "midpoint":
             self.launch(k.guard, [self.parameters, self.bodies, self.rows, self.next_velocity, h, self.tolerance, self.rounding])
             self.launch(k.integrate_midpoint, [*scene, self.bodies, self.next_velocity, self.wrench, h, self.q, self.v], b)
         else:
             self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
         self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
+
+    def _solve_kernels(self, todo: wp.array, number: wp.array, status: wp.array) -> None:
+        """The environments todo[:number] by the first method, those left by the next, and so on; each answer certified."""
+        self.queued.zero_()
+        self._solve_with(0, todo, number, status)
+
+    def _solve_with(self, i: int, todo: wp.array, number: wp.array, status: wp.array) -> None:
+        last = i + 1 == len(self._methods)
+        left, number_left = (todo, number) if last else (self.queues[i], self.queued[i : i + 1])
+        self._methods[i].launch(self, todo, number)
+        lists = [todo, number, left, number_left]
+        answer = [*lists, self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, status]
+        problem = [self.bodies, self.dt, self.tolerance, i, int(last), self.next_velocity, self.rows, self.slots]
+        self.launch(self._kernels.certify, [*problem, *answer])
+        if not last:
+            self._where(number_left, lambda: self._solve_with(i + 1, left, number_left, status))
+
+    def _where(self, number: wp.array, launches: Callable[[], None]) -> None:
+        """Launches that are skipped on the device while number is zero; where a device cannot, each finds nothing to do."""
+        if self.device.is_cpu or wp.is_conditional_graph_supported():
+            wp.capture_if(number, launches)
+        else:
+            launches()
+
+    def _judge_kernels(self) -> None:
+        """Where a rebound would raise the energy, the environment again with less restitution (kernels/restitution.py)."""
+        k, bounces = self._kernels, self.bounces
+        step = [self.dt, self.tolerance, int(self.integrator == "midpoint")]
+        answer = [*step, self.rows, bounces, self.unsolved, self.reason]
+
+        def solve_again() -> None:
+            for attempt in range(1, restitution.EXTRA_SOLVES + 1):
+                self._solve_kernels(bounces.todo, bounces.again, bounces.status)
+                bounces.again.zero_()
+                self.launch(k.judge, [attempt, *answer])
+
+        bounces.again.zero_()
+        self.launch(k.judge, [0, *answer])
+        self._where(bounces.again, solve_again)
+        self.launch(k.settle, [self.rows, bounces, self.status])
 
     def launch(self, kernel: wp.Kernel, inputs: list[Any], width: int = 1) -> None:
         """Launch a kernel whose threads stride over the environments, ``width`` of them side by side in each.
@@ -418,6 +498,8 @@ class Simulator:
         for array, values in ((self.q, m.q0), (self.q0, m.q0), (self.v, m.v0), (self.v0, m.v0)):
             array.assign(np.tile(values.astype(self._numpy_real), (e, 1)))
         self.wrench = self._array(b, t.spatial)
+        self.everyone: wp.array = wp.array(np.arange(e, dtype=np.int32), dtype=int, device=self.device)
+        self.num_everyone: wp.array = wp.array([e], dtype=int, device=self.device)
         self.status, self.iterations, self.unsolved, self.reason = (wp.zeros(e, dtype=int, device=self.device) for _ in range(4))
         self.residual, self.residual_energy, self.best_residual = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(3))
 
@@ -426,10 +508,19 @@ class Simulator:
         self._methods = [method(self.model, self.real, self.law) for method in chosen(self.method, self.precision, self.law)]
         for method in self._methods:
             method.prepare(self)
+        # Environments that each method but the last leaves to the next.
+        left = len(self._methods) - 1
+        self.queues: wp.array = wp.empty((left, self.num_envs), dtype=int, device=self.device)
+        self.queued: wp.array = wp.zeros(left, dtype=int, device=self.device)
         pair_kernels = [kernel for kernel, *_ in self._pair_kernels]
-        self.kernels = [*vars(self._kernels).values(), *pair_kernels, *(m.kernel for m in self._methods)]
+        self.kernels: list[Any] = []
+        self._load([*vars(self._kernels).values(), *pair_kernels, *(m.kernel for m in self._methods)])
+
+    def _load(self, kernels: list[Any]) -> None:
+        """Compile kernels, side by side, and put them on the device."""
+        self.kernels += kernels
         by_block: dict[int, list[Any]] = {}
-        for kernel in self.kernels:
+        for kernel in kernels:
             by_block.setdefault(kernel.module.options["block_dim"], []).append(kernel.module)
         for block_dim, modules in by_block.items():
             wp.force_load(self.device, modules=modules, block_dim=block_dim)
@@ -447,6 +538,9 @@ def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNames
         certify=certify.make(real),
         reset=reset.make(real),
     )
+    if model.restitution.any():
+        rebound = restitution.make(real)
+        stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
     if integrator == "midpoint":
         stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
     else:

@@ -664,10 +664,8 @@ class _Reader:
         static, dynamic = _written(api.GetStaticFrictionAttr().Get()), _written(api.GetDynamicFrictionAttr().Get())
         if dynamic > static:
             self.notes.append(f"{path}: dynamicFriction {dynamic:g} exceeds staticFriction {static:g}: {dynamic:g} is taken for both")
-        if api.GetRestitutionAttr().Get():
-            what = f"physics:restitution = {_written(api.GetRestitutionAttr().Get()):g}"
-            self.ignored.append(Ignored(str(path), what, "restitution is not simulated yet"))
-        material = Material(static_friction=max(static, dynamic), dynamic_friction=dynamic)
+        bounce = _written(api.GetRestitutionAttr().Get())
+        material = Material(static_friction=max(static, dynamic), dynamic_friction=dynamic, restitution=bounce)
         for name, field in CONTACT_ATTRIBUTES.items():
             attribute = prim.GetAttribute(name)
             if attribute and attribute.Get() is not None:
