@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks speed|robust|resources|lcp|peers [--help]"""
+"""python -m benchmarks speed|robust|resources|lcp|paper|peers [--help]"""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from . import lcp, peers, report, resources, robust, speed
+from . import lcp, paper, paper_picture, peers, report, resources, robust, speed
 from .peers import compare
 
 
@@ -47,6 +47,8 @@ def arguments() -> argparse.Namespace:
     crowd.add_argument("--seconds", type=float, default=10.0, help="simulated time (default 10)")
     crowd.add_argument("--device", default=None, help="Warp device (default: Warp's)")
     commands.add_parser("resources", parents=[out], help="what the kernels take of a GPU")
+    comparison = commands.add_parser("paper", parents=[quick], help="the paper's own comparison: formulations, lead matrices, Fig. 4")
+    comparison.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
     others = commands.add_parser("peers", help="other engines on the same scenes").add_subparsers(dest="action", required=True)
     for action, parents, what in (
         ("install", [place], "make the interpreters of the peers, with pip"),
@@ -95,6 +97,16 @@ def main() -> None:
         data = compared(asked.names, asked.quick, asked.dir)
         if not data:
             return
+    elif asked.what == "paper":
+        data = paper.measure(device, asked.quick)
+        print(paper.markdown(data))
+        if asked.out or not asked.quick:  # a quick run leaves the documents of the repository alone
+            if asked.out is None:
+                paper.document(paper.markdown(data))
+            else:
+                asked.out.mkdir(parents=True, exist_ok=True)
+            paper_picture.draw(data, (asked.out or paper.DOCS) / "paper_comparison")
+        asked.out = asked.out or Path("benchmarks/results")
     elif asked.what == "robust":
         rows = robust.measure(device, asked.scenes, asked.formulations, asked.envs, asked.seconds)
         print(robust.markdown(rows))

@@ -17,6 +17,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp import scenes
 from warp_lcp.cli import SAMPLES, Tally, bytes_per_env, main
+from warp_lcp.laws import FORMULATIONS, Law
 
 pytest.importorskip("pxr", reason="needs the extra 'usd'")
 
@@ -60,8 +61,8 @@ def python(*arguments, **options):
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, **options)
 
 
-def info(capsys, scene):
-    assert main(["info", str(scene), "--json"]) == 0
+def info(capsys, scene, *options):
+    assert main(["info", str(scene), "--json", *map(str, options)]) == 0
     return json.loads(capsys.readouterr().out)
 
 
@@ -77,6 +78,58 @@ def test_info_of_the_paper_box(capsys):
     assert (facts["dofs"], facts["mass"], facts["gravity"], facts["joints"]) == (6, 1.0, [0.0, 0.0, -9.81], [])
     assert (facts["contact_slots"], facts["max_contacts"], facts["largest_lcp"]) == (8, 8, 40)
     assert (facts["simulable"], facts["ignored"], facts["unsupported"]) == (True, [], [])
+
+
+@pytest.mark.parametrize(
+    ("formulation", "sliding", "directions", "unknowns", "friction"),
+    [
+        (
+            "phantom_inertia",
+            "regularized",
+            2,
+            40,
+            "phantom_inertia, regularized: isotropic while sliding; the limit of a sticking contact is ",
+        ),
+        ("phantom_inertia", "aligned", 3, 56, "(k = 3: at most +15 % elsewhere)"),
+        (
+            "phantom_inertia",
+            "facets",
+            2,
+            40,
+            "around the cone, from world x, +41 % friction between directions (stops up to 29 % too early)",
+        ),
+        ("phantom_inertia", "facets", 8, 136, "+2 % friction between directions (stops up to 1.9 % too early)"),
+        (
+            "anitescu_potra",
+            "regularized",
+            2,
+            48,
+            "within the cone, from world x, -29 % friction between directions (stops up to 41 % too far)",
+        ),
+        ("anitescu_potra", "regularized", 4, 80, "-7.6 % friction between directions (stops up to 8.2 % too far)"),
+        ("box", "regularized", 2, 40, "(stops up to 29 % too early); limits follow the normal force of the step before"),
+        ("hybrid", "regularized", 2, 40, "hybrid: isotropic while sliding; "),
+        ("coulomb", "regularized", 2, None, "coulomb: exact"),
+    ],
+)
+def test_info_is_about_the_law_that_would_run(capsys, formulation, sliding, directions, unknowns, friction):
+    options = {"formulation": formulation, "sliding": sliding, "directions": directions}
+    facts = info(capsys, "box_on_ground", *(f"--{name}={value}" for name, value in options.items()))
+    model = wl.load_usd("box_on_ground")
+    sim = wl.Simulator(model, device="cpu", **options)
+    assert sorted(facts["kernels"]) == sorted(kernel.key.rpartition("__")[2] for kernel in sim.kernels)
+    assert facts["bytes_per_env"] == bytes_per_env(model, Law(**options))
+    assert facts["largest_lcp"] == unknowns
+    assert friction in facts["friction"]
+    assert main(["info", "box_on_ground", *(f"--{name}={value}" for name, value in options.items())]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert " ".join(facts["friction"].split()) in text
+    assert ("none, the cone itself" if unknowns is None else f"{unknowns} unknowns") in text
+
+
+@pytest.mark.parametrize(("option", "value"), [("--formulation", "magic"), ("--sliding", "magic"), ("--directions", "1")])
+def test_info_refuses_laws_that_there_are_not(capsys, option, value):
+    assert f"{option.strip('-')} is" in error_line(capsys, "info", "box_on_ground", option, value)
 
 
 @pytest.mark.parametrize("scene", scenes.names())
@@ -118,7 +171,8 @@ def test_info_lists_what_cannot_be_simulated(capsys, tmp_path):
     assert "/Hinge" in text
 
 
-def test_bytes_per_env_are_those_of_a_simulator():
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_bytes_per_env_are_those_of_a_simulator(formulation):
     def size(owner):
         """Bytes of the arrays that a simulator or one of its bundles holds."""
         total = 0
@@ -131,8 +185,8 @@ def test_bytes_per_env_are_those_of_a_simulator():
 
     for scene in ("box_on_ground", "bouncing_balls"):
         model = wl.load_usd(scene)
-        one, three = (size(wl.Simulator(model, n, device="cpu")) for n in (1, 3))
-        assert bytes_per_env(model) == pytest.approx((three - one) / 2)
+        one, three = (size(wl.Simulator(model, n, formulation=formulation, device="cpu")) for n in (1, 3))
+        assert bytes_per_env(model, Law(formulation)) == pytest.approx((three - one) / 2)
 
 
 # ------------------------------------------------------------------------------------------------------------------ run

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from .errors import MissingExtra, ModelError, WarpLcpError
+from .laws import Law
 
 if TYPE_CHECKING:
     from .logger import RerunLogger
@@ -65,14 +66,15 @@ def _parser() -> _Parser:
     for command in (info, run):
         command.add_argument("scene", metavar="SCENE", help="a USD file or the name of a shipped scene")
         command.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
+        add = command.add_argument
+        add("--formulation", default="phantom_inertia", metavar="F", help="contact law (default phantom_inertia)")
+        add("--sliding", default="regularized", metavar="S", help="sliding contacts: regularized (default), aligned or facets")
+        add("--directions", type=int, default=2, metavar="K", help="friction directions of a sticking contact (default 2)")
     add = run.add_argument
     add("--envs", type=int, default=1, metavar="N", help="environments, all alike (default 1)")
     add("--dt", type=float, default=1e-3, metavar="S", help="step size in seconds (default 0.001)")
     add("--duration", type=float, default=1.0, metavar="S", help="simulated seconds (default 1)")
-    add("--formulation", default="phantom_inertia", metavar="F", help="contact law (default phantom_inertia)")
     add("--method", default="auto", metavar="M", help="how the contact problem is solved (default auto)")
-    add("--sliding", default="regularized", metavar="S", help="sliding contacts: regularized (default), aligned or facets")
-    add("--directions", type=int, default=2, metavar="K", help="friction directions of a sticking contact (default 2)")
     add("--rho-scale", type=float, default=1.0, metavar="A", help="scale of the phantom inertia (default 1)")
     add("--precision", default="float64", metavar="P", help="float64 (default) or float32")
     add("--integrator", default="euler", metavar="I", help="euler (default) or midpoint")
@@ -105,7 +107,7 @@ def _solve(arguments: argparse.Namespace) -> int:
 def _info(arguments: argparse.Namespace) -> int:
     from .usd import read_usd
 
-    facts = describe(read_usd(arguments.scene))
+    facts = describe(read_usd(arguments.scene), Law(arguments.formulation, arguments.sliding, arguments.directions))
     if arguments.json:
         print(json.dumps(facts))
     else:
@@ -113,10 +115,11 @@ def _info(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def describe(reading: SceneReading) -> dict[str, Any]:
-    """What ``warp-lcp info`` says about a scene, ready for JSON; SI units.
+def describe(reading: SceneReading, law: Law | None = None) -> dict[str, Any]:
+    """What ``warp-lcp info`` says about a scene and what it takes under a contact law, ready for JSON; SI units.
 
-    What depends on the whole model (dofs, pairs, contact slots, bytes) is None where the scene cannot be simulated.
+    What depends on the whole model (dofs, pairs, contact slots, bytes) is None where the scene cannot be simulated; the largest
+    LCP is also None where the law is none.
 
     Raises:
         SceneError: there is no physics in the stage.
@@ -138,14 +141,15 @@ def describe(reading: SceneReading) -> dict[str, Any]:
     facts |= {"dofs": None, "shapes": [{"name": n, "type": None, "body": None} for n in reading.shapes], "pairs": None}
     facts |= {"contact_slots": None, "max_contacts": None, "largest_lcp": None, "bytes_per_env": None, "kernels": None}
     if model is not None:
-        facts |= _model_facts(model)
+        facts |= _model_facts(model, law or Law())
+    facts["friction"] = (law or Law()).friction
     facts |= {"mass": reading.mass, "gravity": list(reading.gravity), "up_axis": reading.up_axis}
     facts |= {"meters_per_unit": reading.meters_per_unit, "kilograms_per_unit": reading.kilograms_per_unit}
     facts |= {"notes": list(report.notes), "ignored": [asdict(i) for i in report.ignored]}
     return facts | {"unsupported": [asdict(i) for i in report.unsupported]}
 
 
-def _model_facts(model: Model) -> dict[str, Any]:
+def _model_facts(model: Model, law: Law) -> dict[str, Any]:
     from .methods import LCP_UNKNOWNS
     from .model import JointType, ShapeType
     from .simulator import kernel_names
@@ -165,32 +169,42 @@ def _model_facts(model: Model) -> dict[str, Any]:
         "pairs": [[model.shape_names[a], model.shape_names[b]] for a, b in model.pairs],
         "contact_slots": model.num_slots,
         "max_contacts": model.max_contacts,
-        "largest_lcp": min(model.max_contacts, LCP_UNKNOWNS // 5) * 5,  # a normal unknown and two for each of k = 2 directions
-        "bytes_per_env": bytes_per_env(model),
-        "kernels": kernel_names(model),
+        "largest_lcp": None if law.is_cone else min(model.max_contacts, LCP_UNKNOWNS // law.unknowns) * law.unknowns,
+        "bytes_per_env": bytes_per_env(model, law),
+        "kernels": kernel_names(model, law=law),
     }
 
 
-def bytes_per_env(model: Model, formulation: str = "phantom_inertia") -> int:
+def bytes_per_env(model: Model, law: Law | None = None) -> int:
     """Bytes that one more environment takes, float64: state, contacts and their history, without the method's workspace."""
     import warp as wp
 
     from .kernels import restitution
     from .kernels.types import scalar_types
+    from .methods import chosen
 
-    types = scalar_types(wp.float64)
+    types, law = scalar_types(wp.float64), law or Law()
     widths = {types.Bodies: model.num_bodies, types.Slots: model.num_slots, types.Contacts: model.max_contacts}
     if model.restitution.any():
         widths[restitution.make(wp.float64).Bounces] = model.max_contacts
     total = 2 * 8 * (model.nq + model.nv)  # q, q0, v, v0
     total += 2 * model.num_bodies * wp.types.type_size_in_bytes(types.spatial)  # wrench, next velocity
-    total += 7 * 4 + 3 * 8  # status, iterations, unsolved, reason, lists of environments for three methods; residuals
+    total += 4 * 4 + 3 * 8  # status, iterations, unsolved, reason; residuals
+    total += 4 * len(chosen("auto", "float64", law))  # a list of environments for each method
     for bundle, width in widths.items():
         for name, variable in bundle.vars.items():
-            if (name == "slip" and formulation != "coulomb") or name in ("coefficient", "again"):  # the latter for all alike
+            if (name == "slip" and not law.is_cone) or name in ("coefficient", "again"):  # the latter for all alike
                 continue
             total += wp.types.type_size_in_bytes(variable.type.dtype) * (1 if variable.type.ndim == 1 else width)
     return total
+
+
+def _shown_lcp(facts: dict[str, Any]) -> str:
+    if not facts["simulable"]:
+        return "?"
+    if facts["largest_lcp"] is None:
+        return f"none, the cone itself ({facts['max_contacts']} contacts)"
+    return f"{facts['largest_lcp']} unknowns ({facts['max_contacts']} contacts)"
 
 
 def _print_info(facts: dict[str, Any]) -> None:
@@ -207,9 +221,8 @@ def _print_info(facts: dict[str, Any]) -> None:
         "degrees of freedom": _shown(facts["dofs"]),
         "shape pairs": "?" if facts["pairs"] is None else str(len(facts["pairs"])),
         "contact slots": _shown(facts["contact_slots"]),
-        "largest LCP": "?"
-        if facts["largest_lcp"] is None
-        else f"{facts['largest_lcp']} unknowns ({facts['max_contacts']} contacts, k = 2)",
+        "friction": facts["friction"],
+        "largest LCP": _shown_lcp(facts),
         "memory": "?"
         if facts["bytes_per_env"] is None
         else f"{facts['bytes_per_env']} bytes an environment, without the method's workspace",
@@ -333,7 +346,8 @@ def _simulator(model: Model, arguments: argparse.Namespace) -> Simulator:
     names = ("dt", "formulation", "method", "sliding", "directions", "rho_scale", "precision", "integrator")
     options = {name: getattr(arguments, name) for name in names}
     device = _device(arguments.device)
-    needed, there = arguments.envs * bytes_per_env(model), _memory() if device.is_cpu else device.free_memory
+    law = Law(arguments.formulation, arguments.sliding, arguments.directions)
+    needed, there = arguments.envs * bytes_per_env(model, law), _memory() if device.is_cpu else device.free_memory
     if needed > there:
         raise WarpLcpError(f"--envs {arguments.envs} takes {needed / 1e9:.3g} GB, {device} has {there / 1e9:.3g} GB; give fewer")
     with _status("compiling kernels (first run only)"):

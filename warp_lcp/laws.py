@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+from .errors import WarpLcpError
 
 FORMULATIONS = ("phantom_inertia", "anitescu_potra", "box", "hybrid", "coulomb")
 SLIDING = ("regularized", "aligned", "facets")
@@ -16,12 +19,23 @@ class Law:
     Attributes:
         formulation: one of FORMULATIONS.
         sliding: one of SLIDING, for 'phantom_inertia'; the others have their own way to slide.
-        directions: k of a sticking contact; 'coulomb' has none.
+        directions: k of a sticking contact, at least 2; 'coulomb' has none.
+
+    Raises:
+        WarpLcpError: where there is no such law.
     """
 
     formulation: str = "phantom_inertia"
     sliding: str = "regularized"
     directions: int = 2
+
+    def __post_init__(self) -> None:
+        for name, choices in (("formulation", FORMULATIONS), ("sliding", SLIDING)):
+            if getattr(self, name) not in choices:
+                raise WarpLcpError(f"{name} is {getattr(self, name)!r}; choose one of {', '.join(choices)}")
+        if int(self.directions) != self.directions or self.directions < 2:
+            raise WarpLcpError(f"directions is {self.directions}; give a whole number of at least 2")
+        object.__setattr__(self, "directions", int(self.directions))  # 2.0 is a whole number, but not for a kernel
 
     @property
     def row_arguments(self) -> tuple[int, int, int]:
@@ -59,3 +73,28 @@ class Law:
     def unknowns(self) -> int:
         """Largest number of unknowns of one contact in the LCP."""
         return 1 + 2 * self.directions + int(self.has_generators)
+
+    @property
+    def friction(self) -> str:
+        """One line: how isotropic friction is.
+
+        Half-way between two of k fixed directions a polygon around the cone has mu / cos(pi / 2k), one within it mu cos(pi / 2k);
+        distances of stopping are as its inverse (measured: tests/test_formulations.py).
+        """
+        k, least = self.directions, math.cos(0.5 * math.pi / self.directions)
+        less, more = f"{100 * (1 - least):.2g} %", f"{100 * (1 / least - 1):.2g} %"
+        around = f"fixed facets around the cone, from world x, +{more} friction between directions (stops up to {less} too early)"
+        within = f"fixed facets within the cone, from world x, -{less} friction between directions (stops up to {more} too far)"
+        sticking = f"the limit of a sticking contact is exact along the predicted slip (k = {k}: at most +{more} elsewhere)"
+        frozen = "limits follow the normal force of the step before"
+        return {
+            "phantom_inertia": {
+                "regularized": f"phantom_inertia, regularized: isotropic while sliding; {sticking}",
+                "aligned": f"phantom_inertia, aligned: isotropic while sliding, no friction across the slip; {sticking}",
+                "facets": f"phantom_inertia, facets, k = {k}: {around}",
+            }[self.sliding],
+            "anitescu_potra": f"anitescu_potra, k = {k}: {within}",
+            "box": f"box, k = {k}: {around}; {frozen}",
+            "hybrid": f"hybrid: isotropic while sliding; {sticking}; {frozen}",
+            "coulomb": "coulomb: exact",
+        }[self.formulation]

@@ -15,7 +15,7 @@ import warp as wp
 from .errors import SimulationError, WarpLcpError
 from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset, restitution
 from .kernels.types import scalar_types
-from .laws import FORMULATIONS, SLIDING, Law
+from .laws import Law
 from .methods import METHODS, chosen
 from .model import Model, ShapeType
 from .rollout import Recorder, Rollout
@@ -130,15 +130,12 @@ class Simulator:
         device: Any = None,
         strict: bool = False,
     ):
-        _choice("formulation", formulation, FORMULATIONS)
+        self.law = Law(formulation, sliding, directions)
         _choice("method", method, tuple(METHODS))
-        _choice("sliding", sliding, SLIDING)
         _choice("precision", precision, tuple(PRECISIONS))
         _choice("integrator", integrator, INTEGRATORS)
         if int(num_envs) != num_envs or num_envs < 1:
             raise WarpLcpError(f"num_envs is {num_envs}; give a whole number of at least 1")
-        if int(directions) != directions or directions < 2:
-            raise WarpLcpError(f"directions is {directions}; give a whole number of at least 2")
         if not (np.isfinite(dt) and dt > 0.0):
             raise WarpLcpError(f"dt is {dt} s; it must be finite and greater than zero")
         if not (np.isfinite(rho_scale) and rho_scale > 0.0):
@@ -146,8 +143,7 @@ class Simulator:
         self.model, self.num_envs, self.dt = model, int(num_envs), float(dt)
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
-        self.directions, self.rho_scale, self.strict = int(directions), float(rho_scale), bool(strict)
-        self.law = Law(formulation, sliding, self.directions)
+        self.directions, self.rho_scale, self.strict = self.law.directions, float(rho_scale), bool(strict)
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
         self.tolerance = TOLERANCE
