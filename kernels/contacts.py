@@ -185,7 +185,8 @@ def row_functions(real) -> SimpleNamespace:
             k = 0
         bound = vec2()
         if frozen != 0:
-            bound = mu_row * impulse
+            if history.touched or closed:  # a point in the air has carried nothing
+                bound = mu_row * impulse
             mu_row = vec2()
         t2 = wp.cross(n, t1)
 
