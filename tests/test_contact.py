@@ -155,6 +155,19 @@ def test_asymmetry_is_reported_and_solved_as_given(heap):
     assert s.asymmetry.numpy()[0] == pytest.approx(np.abs(uneven - uneven.T).max() / np.abs(uneven).max())
 
 
+@pytest.mark.parametrize(("row", "column"), [(0, 1), (1, 0), (0, 39), (39, 0), (33, 31)])
+def test_a_block_whose_mirror_is_zero_couples(row, column):
+    """40 contacts, two of them coupled one way only, in one word of the graph's bits or two."""
+    W, q = 2.0 * np.eye(120), np.tile([-1.0, 0.4, 0.3], 40)
+    W[3 * row : 3 * row + 3, 3 * column : 3 * column + 3] = [[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]]
+    s = wl.solve_contact(W, q, 0.1, device="cpu")
+    p = s.impulse.numpy()[0]
+    assert ok(s)
+    assert natural_map(W, q, np.full(40, 0.1), p) < 1e-10
+    np.testing.assert_allclose(s.velocity.numpy()[0], W @ p + q, atol=1e-14)  # round-off of numbers of order 1
+    assert p[3 * row] == pytest.approx(0.375)  # (1 - 0.5 * 0.5) / 2
+
+
 @pytest.mark.parametrize("ratio", [1e3, 1e6])
 def test_mass_ratio(ratio):
     """A heavy cube on a light one on the ground, four points each: no impulse of a solver may be left between them."""

@@ -75,6 +75,19 @@ def solve_contact(
     Raises:
         WarpLcpError: for arguments that do not fit together or numbers that are not finite.
     """
+    solution, command = prepare(W, q, mu, formulation, method, directions, tolerance, device)
+    if command is not None:
+        command.launch()
+    return solution
+
+
+def prepare(
+    W: Any, q: Any, mu: Any, formulation: str, method: str, directions: int, tolerance: float | None, device: Any
+) -> tuple[ContactSolution, wp.Launch | None]:
+    """Everything that :func:`solve_contact` does but the launch, which fills the solution and may be repeated; None: nothing to solve.
+
+    On the CPU the launch reads W, q and mu where they are, so they may not change before it.
+    """
     if formulation not in FORMULATIONS:
         raise WarpLcpError(
             f"solve_contact: formulation is {formulation!r}; choose one of {', '.join(FORMULATIONS)} (box and hybrid need the impulses "
@@ -97,9 +110,9 @@ def solve_contact(
         raise WarpLcpError(f"solve_contact: mu has shape {mu.shape}; give {(batch, contacts)}, {(contacts,)} or one number")
     mu = np.ascontiguousarray(np.broadcast_to(mu, (batch, contacts)))
     for name, array in (("W", W), ("q", q), ("mu", mu)):
-        bad = np.argwhere(~np.isfinite(array) if name != "mu" else ~(np.isfinite(array) & (array >= 0.0)))
-        if len(bad):
-            where = tuple(int(i) for i in bad[0])
+        good = np.isfinite(array) if name != "mu" else np.isfinite(array) & (array >= 0.0)
+        if not good.all():
+            where = tuple(int(i) for i in np.argwhere(~good)[0])
             what = "finite" if name != "mu" else "finite and not negative"
             raise WarpLcpError(f"solve_contact: {name}{list(where)} is {array[where]}; it must be {what}")
     device, real = wp.get_device(device), wp.float64 if kind is np.float64 else wp.float32
@@ -114,12 +127,13 @@ def solve_contact(
         *(wp.zeros(batch, dtype=int, device=device) for _ in range(2)),
     )
     if batch == 0 or contacts == 0:
-        return solution
+        return solution, None
     sweeps, limit = METHODS[method]
-    inputs = [*(wp.array(x, dtype=real, device=device) for x in (W, q, mu)), int(code), limit, sweeps, tolerance]
+    # The kernel only reads them: no copy on the CPU.
+    inputs = [*(wp.array(x, dtype=real, device=device, copy=False) for x in (W, q, mu)), int(code), limit, sweeps, tolerance]
     inputs += contact_workspace(real, slots, contacts, blocks, blocks // 2, device)
     sizes = wp.zeros((batch, 2), dtype=real, device=device)
     s = solution
     outputs = [s.impulse, s.velocity, s.residual, s.natural_map, s.cone_energy, sizes, s.asymmetry, s.iterations, s.status]
-    wp.launch_tiled(problems.make(real), dim=[slots], inputs=inputs + outputs, block_dim=LANES, device=device)
-    return solution
+    command = wp.launch_tiled(problems.make(real), dim=[slots], inputs=inputs + outputs, block_dim=LANES, device=device, record_cmd=True)
+    return solution, command
