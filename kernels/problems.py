@@ -87,7 +87,7 @@ def make(real):
         x = p - u - vec3(mu * wp.sqrt(u[1] * u[1] + u[2] * u[2]), real(0.0), real(0.0))
         size = wp.sqrt(x[1] * x[1] + x[2] * x[2])
         projected = x
-        if size > mu * x[0]:
+        if size > mu * x[0] or x[0] < real(0.0):
             projected = vec3()
             if mu * size > -x[0]:
                 normal = (x[0] + mu * size) / (real(1.0) + mu * mu)

@@ -17,7 +17,7 @@ def natural_map(W, q, mu, p):
     u[:, 0] += mu * np.linalg.norm(u[:, 1:], axis=1)
     x = p.reshape(-1, 3) - u
     normal, size = x[:, 0], np.linalg.norm(x[:, 1:], axis=1)
-    projected = np.where((size <= mu * normal)[:, None], x, 0.0)
+    projected = np.where(((size <= mu * normal) & (normal >= 0.0))[:, None], x, 0.0)
     on_cone = (size > mu * normal) & (mu * size > -normal)
     a = (normal + mu * size)[on_cone] / (1.0 + mu[on_cone] ** 2)
     projected[on_cone] = np.column_stack([a, (mu[on_cone] * a / size[on_cone])[:, None] * x[on_cone, 1:]])
@@ -99,6 +99,13 @@ def test_residual_is_the_one_of_the_literature(heap, mu):
     assert ok(s)
     assert error < 1e-10
     assert s.natural_map.numpy()[0] == pytest.approx(error, rel=1e-3, abs=1e-14)
+
+
+def test_open_contact_without_friction_is_no_violation():
+    """The cone of mu = 0 is a half-line: nothing but its tip is near -u where u_n > 0 and u_t = 0."""
+    s = wl.solve_contact(np.eye(3), [1.0, 0.0, 0.0], 0.0, device="cpu")
+    assert ok(s)
+    assert s.natural_map.numpy()[0] == 0.0
 
 
 @pytest.mark.parametrize("formulation", ["phantom_inertia", "anitescu_potra"])
