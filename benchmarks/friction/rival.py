@@ -40,7 +40,7 @@ def measure(problem: Problem, python: Path, quick: bool) -> list[dict[str, Any]]
         "solvers": SOLVERS,
         "storages": STORAGES[:2] if quick else STORAGES,
         "tolerances": TOLERANCES[1:2] if quick else TOLERANCES,
-        "limit_s": 1.0 if quick else 10.0,
+        "limit_s": 1.0 if quick else 5.0,
         "budget_s": 0.1 if quick else 0.5,
         "repetitions": 4 if quick else 16,
     }
