@@ -33,13 +33,15 @@ def main() -> None:
         text = speed.markdown(rows, start)
         data = {"start_up": start, "rows": rows}
     elif arguments.what == "friction":
-        data, text = friction.run(arguments.problems, device, arguments.siconos, arguments.docs, arguments.quick)
+        data, text = friction.run(arguments.problems, device, arguments.siconos, arguments.quick)
     else:
         table = [row for precision in ("float64", "float32") for row in resources.measure(precision)]
         text = resources.markdown(table)
         data = {"rows": [vars(row) for row in table]}
     print(text)
     print(f"\nwritten to {report.write(arguments.out, arguments.what, device, json.loads(json.dumps(data)))}")
+    if arguments.what == "friction" and not arguments.quick and any(row["siconos"] for row in data.get("recorded", [])):
+        print(f"drawn: {', '.join(str(path) for path in friction.picture.draw(data['recorded'], arguments.docs))}")
 
 
 if __name__ == "__main__":

@@ -77,6 +77,15 @@ def test_best_is_the_fastest_that_solved():
     assert summary.best(entries, 1e-13) is None
 
 
+def test_relevant_entries_say_the_same():
+    entries = [entry(1.0, 1e-5), entry(4.0), entry(3.0, 1e-8), entry(9.0), entry(2.0, 1e-3, "PROX"), entry(3.0, 1e-4, "PROX")]
+    entries += [{"solver": "ADMM", "storage": "sbm", "outcome": "time"}, entry(7.0, 1e-12, "VI_EG")]
+    kept = summary.relevant(entries)
+    assert [(e["solver"], e.get("median_s")) for e in kept] == [("NSGS", 3.0), ("NSGS", 4.0), ("PROX", 3.0), ("ADMM", None), ("VI_EG", 7.0)]
+    for tolerance in summary.TOLERANCES:
+        assert summary.best(kept, tolerance) == summary.best(entries, tolerance)
+
+
 def test_counts():
     rows = [
         row(5.0, 1.0, [entry(2.0), entry(1.5, 1e-8, "PROX")]),  # a call loses, a launch wins
@@ -218,7 +227,7 @@ def test_no_recorded_problems_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(stress, "WORST", ())
     import warp as wp
 
-    data, text = friction.run(tmp_path, wp.get_device("cpu"), Path(sys.executable), tmp_path, quick=True)
+    data, text = friction.run(tmp_path, wp.get_device("cpu"), Path(sys.executable), quick=True)
     assert list(data) == ["stress"]
     assert data["stress"]["problems"] == 2
     assert text.startswith("2 of 2 random problems certified")

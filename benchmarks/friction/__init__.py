@@ -10,7 +10,9 @@ from typing import Any
 import warp as wp
 from tqdm import tqdm
 
-from . import facets, floor, ours, recorded, rival, stress, summary
+from . import facets, floor, ours, picture, recorded, rival, stress, summary
+
+__all__ = ["PROBLEMS", "measure", "picture", "run"]
 
 PROBLEMS = Path("../shared/problems/friction")
 LARGEST = 8  # problems whose stages are measured
@@ -22,13 +24,13 @@ def measure(problems: list[recorded.Problem], device: wp.Device, python: Path, q
     for problem in tqdm(problems, desc="recorded", disable=None):
         row: dict[str, Any] = {"problem": problem.name, "contacts": problem.contacts, "rank": problem.rank}
         row["ours"] = {method: ours.measure(problem, method, device, quick) for method in ours.METHODS}
-        row["siconos"] = [] if missing else rival.measure(problem, python, quick)
+        row["siconos"] = [] if missing else summary.relevant(rival.measure(problem, python, quick))
         rows.append(row)
     return rows, missing
 
 
-def run(folder: Path, device: wp.Device, python: Path, pictures: Path, quick: bool) -> tuple[dict[str, Any], str]:
-    """Everything; returns data and text. The picture needs Siconos' rows and is drawn by a full run only."""
+def run(folder: Path, device: wp.Device, python: Path, quick: bool) -> tuple[dict[str, Any], str]:
+    """Everything but the picture; returns data and text."""
     data: dict[str, Any] = {}
     text = []
     problems = recorded.find(folder)
@@ -41,10 +43,6 @@ def run(folder: Path, device: wp.Device, python: Path, pictures: Path, quick: bo
         text += [summary.markdown(rows), facets.markdown(near), floor.markdown(stages, rate)]
         if missing:
             print(missing, file=sys.stderr)
-        elif not quick:
-            from . import picture
-
-            text += [f"drawn: {', '.join(str(path) for path in picture.draw(rows, pictures))}"]
     else:
         print(f"{folder} holds no recorded problems (*.npz): only the random ones are solved", file=sys.stderr)
     rows = stress.measure(device, stress.QUICK_COUNT if quick else stress.COUNT)

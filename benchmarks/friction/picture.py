@@ -24,7 +24,7 @@ STYLES = (
 
 
 def draw(rows: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
-    """Write friction_profile.png and .svg into a folder; one panel for each tolerance."""
+    """Write friction_profile.png and .svg into a folder; one panel for each tolerance. Needs the extra 'bench'."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -33,6 +33,17 @@ def solvers(rows: Sequence[dict[str, Any]]) -> list[str]:
     return list(dict.fromkeys(e["solver"] for row in rows for e in row["siconos"]))
 
 
+def relevant(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of every solver the fastest entries at the tolerances, or the closest where it solved nothing, or how it ended."""
+    kept = []
+    for solver in dict.fromkeys(e["solver"] for e in entries):
+        own = [e for e in entries if e["solver"] == solver]
+        closest = min(own, key=lambda e: e.get("natural_map", math.inf))
+        found = [best(own, tolerance) or closest for tolerance in TOLERANCES]
+        kept += found[:1] if found[0] is found[1] else found
+    return kept
+
+
 def counts(rows: Sequence[dict[str, Any]], tolerance: float) -> dict[str, Any]:
     """How many problems each solver solved, and on how many `auto` did and took less time than Siconos' fastest (which may be none)."""
     result: dict[str, Any] = {"tolerance": tolerance, "problems": len(rows), "solved": {}, "faster": {}}
