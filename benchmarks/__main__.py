@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks speed|robust|resources|lcp|paper|peers [--help]"""
+"""python -m benchmarks speed|robust|resources|lcp|friction|paper|peers [--help]"""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from . import lcp, paper, paper_picture, peers, report, resources, robust, speed
+from . import friction, lcp, paper, paper_picture, peers, report, resources, robust, speed
 from .peers import compare
 
 
@@ -40,6 +40,11 @@ def arguments() -> argparse.Namespace:
     )
     recorded = commands.add_parser("lcp", parents=[out, quick], help="every method for LCPs on recorded problems")
     recorded.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
+    cones = commands.add_parser("friction", parents=[out, quick], help="solve_contact on recorded problems, beside Siconos")
+    cones.add_argument("--problems", type=Path, default=friction.PROBLEMS, help="folder of .npz files with W, q, mu")
+    cones.add_argument("--siconos", type=Path, default=Path("/usr/bin/python3"), help="Python that has Siconos (default: the system's)")
+    cones.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the picture (default: docs)")
+    cones.add_argument("--device", default=None, help="Warp device (default: Warp's)")
     crowd = commands.add_parser("robust", parents=[out], help="randomised environments of every shipped scene: what is certified")
     crowd.add_argument("--scenes", type=lambda text: text.split(","), default=robust.scenes(), metavar="NAME,...", help="default: all")
     crowd.add_argument("--formulations", type=lambda text: text.split(","), default=["phantom_inertia", "coulomb"], metavar="NAME,...")
@@ -118,6 +123,11 @@ def main() -> None:
             raise SystemExit(f"python -m benchmarks: error: {error}") from error
         print(lcp.markdown(rows))
         data = {"rows": rows}
+    elif asked.what == "friction":
+        data, text = friction.run(asked.problems, device, asked.siconos, asked.quick)
+        print(text)
+        if not asked.quick and any(row["siconos"] for row in data.get("recorded", [])):
+            print(f"drawn: {', '.join(str(path) for path in friction.picture.draw(data['recorded'], asked.docs))}")
     else:
         table = [row for precision in ("float64", "float32") for row in resources.measure(precision)]
         print(resources.markdown(table))

@@ -16,7 +16,7 @@ def make(real):
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     f = proximal.functions(real)
     Graph, ContactProblem = f.Graph, f.ContactProblem
-    clear, connect, analyse, proximal_newton = f.clear, f.connect, f.analyse, f.proximal_newton
+    clear, connect, complete, analyse, proximal_newton = f.clear, f.connect, f.complete, f.analyse, f.proximal_newton
     law = friction.functions(real)
     weigh, law_error = law.weigh, law.law_error
     round_off = real(1.0e-15) if real is wp.float64 else real(1.0e-6)
@@ -32,23 +32,23 @@ def make(real):
     @wp.func
     def couple(g: Graph, slot: int, n: int, W: wp.array3d(dtype=real), problem: int, lane: int) -> vec2:
         """Neighbours from the blocks that are not zero; returns max |W| and max |W - W^T| over the rows of this lane."""
-        size = real(0.0)
-        difference = real(0.0)
+        size = vec3()
+        difference = vec3()
         for i in range(lane, n, wp.block_dim()):
             clear(g, slot, n, i)
-            for j in range(n):
-                coupled = bool(False)
-                for x in range(3):
-                    for y in range(3):
-                        a = W[problem, 3 * i + x, 3 * j + y]
-                        b = W[problem, 3 * j + y, 3 * i + x]
-                        coupled = coupled or a != real(0.0) or b != real(0.0)
-                        size = wp.max(size, wp.abs(a))
-                        difference = wp.max(difference, wp.abs(a - b))
-                if coupled and j != i:
+            for j in range(i, n):
+                a = block_of(W, problem, i, j)
+                b = wp.transpose(block_of(W, problem, j, i))
+                # Three chains of maxima and no more: their latency is what this loop costs.
+                largest = wp.max(wp.max(wp.abs(a[0]), wp.abs(a[1])), wp.abs(a[2]))
+                largest = wp.max(largest, wp.max(wp.max(wp.abs(b[0]), wp.abs(b[1])), wp.abs(b[2])))
+                size = wp.max(size, largest)
+                difference = wp.max(difference, wp.max(wp.max(wp.abs(a[0] - b[0]), wp.abs(a[1] - b[1])), wp.abs(a[2] - b[2])))
+                if wp.max(largest) > real(0.0) and j != i:
                     connect(g, slot, i, j)
         sync()
-        return vec2(size, difference)
+        complete(g, slot, n, lane)
+        return vec2(wp.max(size), wp.max(difference))
 
     @wp.func
     def load(
@@ -87,7 +87,7 @@ def make(real):
         x = p - u - vec3(mu * wp.sqrt(u[1] * u[1] + u[2] * u[2]), real(0.0), real(0.0))
         size = wp.sqrt(x[1] * x[1] + x[2] * x[2])
         projected = x
-        if size > mu * x[0]:
+        if size > mu * x[0] or x[0] < real(0.0):
             projected = vec3()
             if mu * size > -x[0]:
                 normal = (x[0] + mu * size) / (real(1.0) + mu * mu)
@@ -125,8 +125,23 @@ def make(real):
             analyse(g, slot, n, lane)  # there is room: the workspace is made for n
             load(g, c, slot, n, W, q, mu, directions, problem, lane)
             result = proximal_newton(g, c, slot, n, real(0.01) * tolerance, real(1.0e30), sweeps, newton_limit, lane)
+            # Everything below from W, q, mu and p alone, with W as it was given.
+            for i in range(lane, n, wp.block_dim()):
+                u = c.free[slot, i]
+                terms = vec3()
+                for e in range(g.row[slot, i] - 1, g.row[slot, i + 1]):
+                    j = int(i)
+                    if e >= g.row[slot, i]:
+                        j = g.column[slot, e]
+                    block = block_of(W, problem, i, j)
+                    for x in range(3):
+                        term = c.impulse[slot, j][x] * wp.transpose(block)[x]
+                        u += term
+                        terms += wp.abs(term)
+                c.velocity[slot, i] = u
+                c.error[slot, i] = wp.max(terms)
+            sync()
             if lane == 0:
-                # Everything below from W, q, mu and p alone, with W as it was given.
                 worst = real(0.0)
                 size = real(0.0)
                 largest_sum = real(0.0)
@@ -135,19 +150,12 @@ def make(real):
                 energy = real(0.0)
                 for i in range(n):
                     p = c.impulse[slot, i]
-                    free = vec3(q[problem, 3 * i], q[problem, 3 * i + 1], q[problem, 3 * i + 2])
-                    u = free
-                    terms = vec3()
-                    for j in range(3 * n):
-                        x = c.impulse[slot, j // 3][j % 3]
-                        if x != real(0.0):
-                            term = x * vec3(W[problem, 3 * i, j], W[problem, 3 * i + 1, j], W[problem, 3 * i + 2, j])
-                            u += term
-                            terms += wp.abs(term)
-                    largest_sum = wp.max(largest_sum, wp.max(terms))
+                    free = c.free[slot, i]
+                    u = c.velocity[slot, i]
+                    largest_sum = wp.max(largest_sum, c.error[slot, i])
                     k = c.directions[slot, i]
                     diagonal = wp.get_diag(g.diagonal[slot, i])
-                    m = vec2(mu[problem, i], mu[problem, i])
+                    m = c.mu[slot, i]
                     worst = wp.max(worst, wp.max(wp.abs(law_error(u, p, weigh(diagonal, k), m, vec2(), k))))
                     size = wp.max(size, wp.max(wp.abs(free)))
                     w = weigh(diagonal, DISC)

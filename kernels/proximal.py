@@ -288,6 +288,7 @@ def functions(real) -> SimpleNamespace:
         Graph=Graph,
         clear=s.clear,
         connect=s.connect,
+        complete=s.complete,
         analyse=s.analyse,
         ContactProblem=ContactProblem,
         proximal_newton=proximal_newton,

@@ -68,6 +68,15 @@ def functions(real, size: int) -> SimpleNamespace:
         g.adjacent[slot, i, j // WORD] = g.adjacent[slot, i, j // WORD] | (wp.uint32(1) << wp.uint32(j % WORD))
 
     @wp.func
+    def complete(g: Graph, slot: int, n: int, lane: int):
+        """Make neighbours of each other where the one of lower number has been connected to the other."""
+        for i in range(lane, n, wp.block_dim()):
+            for j in range(i):
+                if is_neighbour(g, slot, j, i):
+                    connect(g, slot, i, j)
+        sync()
+
+    @wp.func
     def disconnect(g: Graph, slot: int, i: int, j: int):
         g.adjacent[slot, i, j // WORD] = g.adjacent[slot, i, j // WORD] & ~(wp.uint32(1) << wp.uint32(j % WORD))
 
@@ -108,24 +117,32 @@ def functions(real, size: int) -> SimpleNamespace:
     @wp.func
     def eliminate(g: Graph, slot: int, n: int, words: int, lane: int):
         """Order by minimum degree; row i of the bits becomes the neighbours of i when its turn came."""
+        least = int(0)  # no degree is less: elimination takes one neighbour and gives those that are left
         for s in range(n):
             best = int(-1)
-            for i in range(n):
+            i = int(0)
+            while i < n and (best < 0 or g.degree[slot, best] > least):
                 d = g.degree[slot, i]
                 if d >= 0 and (best < 0 or d < g.degree[slot, best]):
                     best = i
+                i += 1
+            least = wp.max(g.degree[slot, best] - 1, 0)
             sync()
             if lane == 0:
                 g.order[slot, s] = best
                 g.step[slot, best] = s
                 g.degree[slot, best] = -1
-            for j in range(lane, n, wp.block_dim()):
-                if is_neighbour(g, slot, best, j):
-                    for w in range(words):
-                        g.adjacent[slot, j, w] = g.adjacent[slot, j, w] | g.adjacent[slot, best, w]
-                    disconnect(g, slot, j, j)
-                    disconnect(g, slot, j, best)
-                    g.degree[slot, j] = count(g, slot, j, words)
+            for ww in range(words):
+                bits = g.adjacent[slot, best, ww]
+                if bits != wp.uint32(0):
+                    for b in range(lane, WORD, wp.block_dim()):
+                        if (bits >> wp.uint32(b)) & wp.uint32(1) != wp.uint32(0):
+                            j = WORD * ww + b
+                            for w in range(words):
+                                g.adjacent[slot, j, w] = g.adjacent[slot, j, w] | g.adjacent[slot, best, w]
+                            disconnect(g, slot, j, j)
+                            disconnect(g, slot, j, best)
+                            g.degree[slot, j] = count(g, slot, j, words)
             sync()
 
     @wp.func
@@ -314,5 +331,12 @@ def functions(real, size: int) -> SimpleNamespace:
         sync()
 
     return SimpleNamespace(
-        Graph=Graph, clear=clear, connect=connect, analyse=analyse, clear_factors=clear_factors, factorise=factorise, solve=solve
+        Graph=Graph,
+        clear=clear,
+        connect=connect,
+        complete=complete,
+        analyse=analyse,
+        clear_factors=clear_factors,
+        factorise=factorise,
+        solve=solve,
     )

@@ -17,7 +17,7 @@ def natural_map(W, q, mu, p):
     u[:, 0] += mu * np.linalg.norm(u[:, 1:], axis=1)
     x = p.reshape(-1, 3) - u
     normal, size = x[:, 0], np.linalg.norm(x[:, 1:], axis=1)
-    projected = np.where((size <= mu * normal)[:, None], x, 0.0)
+    projected = np.where(((size <= mu * normal) & (normal >= 0.0))[:, None], x, 0.0)
     on_cone = (size > mu * normal) & (mu * size > -normal)
     a = (normal + mu * size)[on_cone] / (1.0 + mu[on_cone] ** 2)
     projected[on_cone] = np.column_stack([a, (mu[on_cone] * a / size[on_cone])[:, None] * x[on_cone, 1:]])
@@ -101,6 +101,13 @@ def test_residual_is_the_one_of_the_literature(heap, mu):
     assert s.natural_map.numpy()[0] == pytest.approx(error, rel=1e-3, abs=1e-14)
 
 
+def test_open_contact_without_friction_is_no_violation():
+    """The cone of mu = 0 is a half-line: nothing but its tip is near -u where u_n > 0 and u_t = 0."""
+    s = wl.solve_contact(np.eye(3), [1.0, 0.0, 0.0], 0.0, device="cpu")
+    assert ok(s)
+    assert s.natural_map.numpy()[0] == 0.0
+
+
 @pytest.mark.parametrize("formulation", ["phantom_inertia", "anitescu_potra"])
 @pytest.mark.parametrize("k", [2, 3, 4, 8, 16])
 def test_facets_obey_their_law(heap, formulation, k):
@@ -153,6 +160,19 @@ def test_asymmetry_is_reported_and_solved_as_given(heap):
     assert ok(s)
     assert natural_map(uneven, q, mu, s.impulse.numpy()[0]) < 1e-10
     assert s.asymmetry.numpy()[0] == pytest.approx(np.abs(uneven - uneven.T).max() / np.abs(uneven).max())
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 1), (1, 0), (0, 39), (39, 0), (33, 31)])
+def test_a_block_whose_mirror_is_zero_couples(row, column):
+    """40 contacts, two of them coupled one way only, in one word of the graph's bits or two."""
+    W, q = 2.0 * np.eye(120), np.tile([-1.0, 0.4, 0.3], 40)
+    W[3 * row : 3 * row + 3, 3 * column : 3 * column + 3] = [[0.5, 0, 0], [0, 0.5, 0], [0, 0, 0.5]]
+    s = wl.solve_contact(W, q, 0.1, device="cpu")
+    p = s.impulse.numpy()[0]
+    assert ok(s)
+    assert natural_map(W, q, np.full(40, 0.1), p) < 1e-10
+    np.testing.assert_allclose(s.velocity.numpy()[0], W @ p + q, atol=1e-14)  # round-off of numbers of order 1
+    assert p[3 * row] == pytest.approx(0.375)  # (1 - 0.5 * 0.5) / 2
 
 
 @pytest.mark.parametrize("ratio", [1e3, 1e6])

@@ -78,6 +78,19 @@ def solve_contact(
         WarpLcpError: for arguments that do not fit together or numbers that are not finite. Numbers on a GPU are not read back:
             there an answer that is not a number is marked.
     """
+    solution, command = prepare(W, q, mu, formulation, method, directions, tolerance, device)
+    if command is not None:
+        command.launch()
+    return solution
+
+
+def prepare(
+    W: Any, q: Any, mu: Any, formulation: str, method: str, directions: int, tolerance: float | None, device: Any
+) -> tuple[ContactSolution, wp.Launch | None]:
+    """Everything that :func:`solve_contact` does but the launch, which fills the solution and may be repeated; None: nothing to solve.
+
+    On the CPU the launch reads W, q and mu where they are, so they may not change before it.
+    """
     if formulation not in FORMULATIONS:
         raise WarpLcpError(
             f"solve_contact: formulation is {formulation!r}; choose one of {', '.join(FORMULATIONS)} (box and hybrid need the impulses "
@@ -113,15 +126,16 @@ def solve_contact(
         *(wp.zeros(batch, dtype=int, device=device) for _ in range(2)),
     )
     if batch == 0 or contacts == 0:
-        return solution
+        return solution, None
     sweeps, limit = METHODS[method]
     inputs = [W, q, mu, int(code), limit, sweeps, tolerance]
     inputs += contact_workspace(real, slots, contacts, blocks, blocks // 2, device)
     sizes = wp.zeros((batch, 2), dtype=real, device=device)
     s = solution
     outputs = [s.impulse, s.velocity, s.residual, s.natural_map, s.cone_energy, sizes, s.asymmetry, s.iterations, s.status]
-    wp.launch_tiled(contact_problem.make(real), dim=[slots], inputs=inputs + outputs, block_dim=LANES, device=device)
-    return solution
+    kernel = contact_problem.make(real)
+    command = wp.launch_tiled(kernel, dim=[slots], inputs=inputs + outputs, block_dim=LANES, device=device, record_cmd=True)
+    return solution, command
 
 
 def _coefficients(mu: Any, batch: int, contacts: int, real: Any, device: Any) -> wp.array:

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the timings of recorded problems say: the best of Siconos, counts, performance profiles, tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+TOLERANCES = (1e-6, 1e-10)
+#: How our times are taken: a key of the row, and its name in tables and pictures.
+TIMINGS = {
+    "call_median_s": "one call",
+    "kernel_median_s": "prepared, one launch",
+    "batch_call_median_s": "one call for a batch",
+    "batch_kernel_median_s": "prepared, batch",
+}
+
+
+def seconds(entry: dict[str, Any], key: str, tolerance: float) -> float:
+    """Time of an entry that solved its problem, else infinity (a nan has not solved anything)."""
+    return entry[key] if entry.get("natural_map", math.inf) <= tolerance else math.inf
+
+
+def best(entries: Sequence[dict[str, Any]], tolerance: float, solver: str | None = None) -> dict[str, Any] | None:
+    """Fastest entry of Siconos that solved the problem, of one solver or of all, whatever the storage; None where none did."""
+    fit = [e for e in entries if (solver is None or e["solver"] == solver) and math.isfinite(seconds(e, "median_s", tolerance))]
+    return min(fit, key=lambda e: e["median_s"], default=None)
+
+
+def solvers(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Siconos' solvers in the order in which they appear."""
+    return list(dict.fromkeys(e["solver"] for row in rows for e in row["siconos"]))
+
+
+def relevant(entries: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of every solver the fastest entries at the tolerances, or the closest where it solved nothing, or how it ended."""
+    kept = []
+    for solver in dict.fromkeys(e["solver"] for e in entries):
+        own = [e for e in entries if e["solver"] == solver]
+        closest = min(own, key=lambda e: e.get("natural_map", math.inf))
+        found = [best(own, tolerance) or closest for tolerance in TOLERANCES]
+        kept += found[:1] if found[0] is found[1] else found
+    return kept
+
+
+def counts(rows: Sequence[dict[str, Any]], tolerance: float) -> dict[str, Any]:
+    """How many problems each solver solved, and on how many `auto` did and took less time than Siconos' fastest (which may be none)."""
+    result: dict[str, Any] = {"tolerance": tolerance, "problems": len(rows), "solved": {}, "faster": {}}
+    for method in rows[0]["ours"]:
+        result["solved"][method] = sum(row["ours"][method]["natural_map"] <= tolerance for row in rows)
+    for solver in solvers(rows):
+        result["solved"][f"Siconos {solver}"] = sum(best(row["siconos"], tolerance, solver) is not None for row in rows)
+    if solvers(rows):
+        result["solved"]["Siconos, any"] = sum(best(row["siconos"], tolerance) is not None for row in rows)
+        for key in TIMINGS:
+            wins = 0
+            for row in rows:
+                rival = best(row["siconos"], tolerance)
+                wins += seconds(row["ours"]["auto"], key, tolerance) < (rival["median_s"] if rival else math.inf)
+            result["faster"][key] = wins
+    return result
+
+
+def times(rows: Sequence[dict[str, Any]], tolerance: float) -> dict[str, list[float]]:
+    """Seconds of every solver on every problem, one problem at a time; infinity where it did not solve it."""
+    table = {
+        "warp_lcp, one call": [seconds(row["ours"]["auto"], "call_median_s", tolerance) for row in rows],
+        "warp_lcp, prepared": [seconds(row["ours"]["auto"], "kernel_median_s", tolerance) for row in rows],
+        "warp_lcp pgs, prepared": [seconds(row["ours"]["pgs"], "kernel_median_s", tolerance) for row in rows],
+    }
+    for solver in solvers(rows):
+        found = [best(row["siconos"], tolerance, solver) for row in rows]
+        table[f"Siconos {solver}"] = [entry["median_s"] if entry else math.inf for entry in found]
+    return table
+
+
+def profile(table: dict[str, list[float]]) -> dict[str, list[float]]:
+    """Ratios to the fastest solver of each problem, ascending, only those of problems solved (Dolan and More 2002).
+
+    A problem that nobody solves counts for nobody: the share of solved problems is len(ratios) / number of problems.
+    """
+    fastest = [min(column) for column in zip(*table.values(), strict=True)]
+    return {
+        solver: sorted(own / least for own, least in zip(column, fastest, strict=True) if math.isfinite(own))
+        for solver, column in table.items()
+    }
+
+
+def unit(value: float) -> str:
+    """Time in us or ms with three digits."""
+    return f"{1e6 * value:.3g} us" if value < 1e-3 else f"{1e3 * value:.3g} ms"
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """Table of the problems, then the counts."""
+    rival = bool(solvers(rows))
+    lines = [
+        "| problem | contacts | rank / 3r | natural map | iterations | " + " | ".join(TIMINGS.values()) + " | pgs: natural map, prepared |"
+    ]
+    lines[0] += " Siconos' best at 1e-6 | at 1e-10 |" if rival else ""
+    lines.append("|" + " --- |" * (lines[0].count("|") - 1))
+    for row in rows:
+        auto, pgs = row["ours"]["auto"], row["ours"]["pgs"]
+        cells = [row["problem"], str(row["contacts"]), f"{row['rank']}/{3 * row['contacts']}", f"{auto['natural_map']:.0e}"]
+        cells += [
+            str(auto["iterations"]),
+            *(unit(auto[key]) for key in TIMINGS),
+            f"{pgs['natural_map']:.0e}, {unit(pgs['kernel_median_s'])}",
+        ]
+        if rival:
+            for tolerance in TOLERANCES:
+                entry = best(row["siconos"], tolerance)
+                cells.append(f"{unit(entry['median_s'])} {entry['solver']} {entry['storage']}" if entry else "none")
+        lines.append("| " + " | ".join(cells) + " |")
+    for tolerance in TOLERANCES:
+        found = counts(rows, tolerance)
+        lines += ["", f"Of {found['problems']} problems, natural map <= {tolerance:g}:"]
+        lines.append("solved: " + ", ".join(f"{name} {number}" for name, number in found["solved"].items()))
+        if found["faster"]:
+            lines.append("auto faster than Siconos' best: " + ", ".join(f"{TIMINGS[key]} {n}" for key, n in found["faster"].items()))
+    return "\n".join(lines)
