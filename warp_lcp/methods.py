@@ -76,7 +76,7 @@ def contact_workspace(real: Any, slots: int, n: int, blocks: int, fill: int, dev
         return wp.empty((slots, max(n, 1)), dtype=dtype, device=device)
 
     problem.free, problem.rho, problem.impulse, problem.velocity = (empty(t.vec3) for _ in range(4))
-    problem.centre, problem.best, problem.step, problem.change = (empty(t.vec3) for _ in range(4))
+    problem.centre, problem.best, problem.first, problem.step, problem.change = (empty(t.vec3) for _ in range(5))
     problem.mu, problem.bound, problem.directions, problem.error = empty(t.vec2), empty(t.vec2), empty(int), empty(real)
     return graph_workspace(real, 3, slots, n, blocks, fill, device), problem
 
