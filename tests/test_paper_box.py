@@ -75,6 +75,16 @@ def test_block_pgs_in_single_precision_agrees_with_double():
     assert stop(1e-3, method="pgs", precision="float32")[0] == pytest.approx(stop(1e-3, method="pgs")[0], abs=1e-3)
 
 
+def test_single_precision_is_as_good_as_it_says():
+    """float32 does not resolve how redundant normals share the weight, which decides how the box turns: bars of 5 mm and 5 mrad at
+    1 ms. It is certified to the same 1e-6 m/s as float64, twice the spacing of its numbers at 5 m/s, in 95 % of the steps."""
+    pose, seen = stop(1e-3, precision="float32")
+    error = np.abs(pose - EXACT_CONE[1e-3])
+    assert error[:2].max() < 5e-3
+    assert error[2] < 5e-3
+    assert seen["not_ok"] < 0.05 * 800
+
+
 def test_fixed_facets_are_wrong_and_aligned_axes_are_not():
     """The square circumscribes the cone: fixed world facets go 0.4 m astray; eq. 34 alone is first order in h."""
     facets = np.abs(stop(1e-3, sliding="facets")[0] - EXACT_CONE[1e-3])
