@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import functools
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +18,8 @@ from .kernels.types import LANES
 from .methods import contact_workspace, workspaces
 
 FORMULATIONS = ("coulomb", "phantom_inertia", "anitescu_potra")
+#: Contacts of a problem whose workspace is kept for the next one of its size (CPU).
+SMALL = 64
 #: Sweeps of block Gauss-Seidel and factorisations of Newton's method, at most.
 METHODS = {"auto": (20, 400), "proximal_newton": (20, 400), "pgs": (10_000, 0)}
 
@@ -129,7 +133,10 @@ def prepare(
         return solution, None
     sweeps, limit = METHODS[method]
     inputs = [W, q, mu, int(code), limit, sweeps, tolerance]
-    inputs += contact_workspace(real, slots, contacts, blocks, blocks // 2, device)
+    if device.is_cpu and contacts <= SMALL:
+        inputs += _kept_workspace(real, contacts, str(device), threading.get_ident())
+    else:
+        inputs += contact_workspace(real, slots, contacts, blocks, blocks // 2, device)
     sizes = wp.zeros((batch, 2), dtype=real, device=device)
     s = solution
     outputs = [s.impulse, s.velocity, s.residual, s.natural_map, s.cone_energy, sizes, s.asymmetry, s.iterations, s.status]
@@ -149,3 +156,10 @@ def _coefficients(mu: Any, batch: int, contacts: int, real: Any, device: Any) ->
         where = [int(i) for i in np.argwhere(mu < 0.0)[0]]
         raise WarpLcpError(f"solve_contact: mu{where or ''} is {mu[tuple(where)]}; it must not be negative")
     return on_device(np.broadcast_to(mu, (batch, contacts)), real, device)
+
+
+@functools.lru_cache(maxsize=8)
+def _kept_workspace(real: Any, contacts: int, device: str, thread: int) -> tuple[Any, Any]:
+    """Workspace of one problem on the CPU, where a launch has ended when it returns: making it anew costs more than a small problem."""
+    blocks = contacts * (contacts - 1)
+    return contact_workspace(real, 1, contacts, blocks, blocks // 2, device)
