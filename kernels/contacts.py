@@ -217,7 +217,7 @@ def row_functions(real) -> SimpleNamespace:
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """Kernels ``combine_pairs`` (dim N, P), ``select_contacts`` (dim E) and ``contact_rows`` (dim E, R)."""
+    """Kernels ``combine_pairs`` (dim N, P), ``select_contacts`` (dim E) and ``contact_rows`` (dim E, lanes)."""
     t = scalar_types(real)
     vec3, vec5 = t.vec3, t.vec5
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
@@ -307,61 +307,61 @@ def make(real) -> SimpleNamespace:
         directions: int,
         frozen: int,
         contacts: Contacts,
+        lanes: int,
         stride: int,
     ):
         """Rows of the selected contacts; velocity and free hold world axes before, the contact frame after."""
-        start, i = wp.tid()
+        start, lane = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
-            if i >= contacts.count[env]:
-                continue
-            slot = contacts.slot[env, i]
-            pair = topology.slot_pair[slot]
-            point = slots.point[env, slot]
-            phi = slots.gap[env, slot]
-            g = wp.length(parameters.gravity[env % parameters.gravity.shape[0]])
-            mu = parameters.pair_friction[env % parameters.pair_friction.shape[0], pair]
-            c = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair]
-            body = topology.pair_body[pair]
-            n = slots.normal[env, slot]
-            w_nn = real(0.0)
-            for side in range(2):
-                b = body[side]
-                if b >= 0:
-                    w_nn += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], point - bodies.com[env, b], n)
-            history = History()
-            history.touched = slots.last_feature[env, slot] == slots.feature[env, slot]
-            history.impulse = slots.last_impulse[env, slot]
-            history.bristle = slots.last_bristle[env, slot]
-            u = contacts.velocity[env, i]
-            u_free = contacts.free[env, i]
-            bend = slots.bend[env, slot]
-            row = make_row(w_nn, n, phi, bend, u, u_free, c, mu, history, g, h, sliding, directions, frozen)
+            for i in range(lane, contacts.count[env], lanes):
+                slot = contacts.slot[env, i]
+                pair = topology.slot_pair[slot]
+                point = slots.point[env, slot]
+                phi = slots.gap[env, slot]
+                g = wp.length(parameters.gravity[env % parameters.gravity.shape[0]])
+                mu = parameters.pair_friction[env % parameters.pair_friction.shape[0], pair]
+                c = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair]
+                body = topology.pair_body[pair]
+                n = slots.normal[env, slot]
+                w_nn = real(0.0)
+                for side in range(2):
+                    b = body[side]
+                    if b >= 0:
+                        w_nn += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], point - bodies.com[env, b], n)
+                history = History()
+                history.touched = slots.last_feature[env, slot] == slots.feature[env, slot]
+                history.impulse = slots.last_impulse[env, slot]
+                history.bristle = slots.last_bristle[env, slot]
+                u = contacts.velocity[env, i]
+                u_free = contacts.free[env, i]
+                bend = slots.bend[env, slot]
+                row = make_row(w_nn, n, phi, bend, u, u_free, c, mu, history, g, h, sliding, directions, frozen)
 
-            t1 = row.frame[1]
-            t2 = row.frame[2]
-            w = vec3(w_nn, real(0.0), real(0.0))
-            for side in range(2):
-                b = body[side]
-                if b >= 0:
-                    arm = point - bodies.com[env, b]
-                    w[1] += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, t1)
-                    w[2] += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, t2)
-            contacts.body[env, i] = body
-            contacts.point[env, i] = point
-            contacts.gap[env, i] = phi
-            contacts.closed[env, i] = int(row.closed)
-            contacts.frame[env, i] = row.frame
-            contacts.inv_mass[env, i] = w
-            contacts.relaxation[env, i] = row.relaxation
-            contacts.shift[env, i] = row.shift
-            contacts.free[env, i] = row.frame * u_free + row.shift
-            contacts.mu[env, i] = row.mu
-            contacts.bound[env, i] = row.bound
-            if row.directions == DISC:
-                contacts.slip[env, i] = vec3(real(1.0), real(0.0), row.lateral)
-            contacts.directions[env, i] = row.directions
-            contacts.damping[env, i] = c[3]
-            contacts.impulse[env, i] = vec3()
-            contacts.state[env, i] = row.state
+                t1 = row.frame[1]
+                t2 = row.frame[2]
+                w = vec3(w_nn, real(0.0), real(0.0))
+                for side in range(2):
+                    b = body[side]
+                    if b >= 0:
+                        arm = point - bodies.com[env, b]
+                        w[1] += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, t1)
+                        w[2] += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, t2)
+                contacts.body[env, i] = body
+                contacts.point[env, i] = point
+                contacts.gap[env, i] = phi
+                contacts.closed[env, i] = int(row.closed)
+                contacts.frame[env, i] = row.frame
+                contacts.inv_mass[env, i] = w
+                contacts.relaxation[env, i] = row.relaxation
+                contacts.shift[env, i] = row.shift
+                contacts.free[env, i] = row.frame * u_free + row.shift
+                contacts.mu[env, i] = row.mu
+                contacts.bound[env, i] = row.bound
+                if row.directions == DISC:
+                    contacts.slip[env, i] = vec3(real(1.0), real(0.0), row.lateral)
+                contacts.directions[env, i] = row.directions
+                contacts.damping[env, i] = c[3]
+                contacts.impulse[env, i] = vec3()
+                contacts.state[env, i] = row.state
 
     return SimpleNamespace(combine_pairs=combine_pairs, select_contacts=select_contacts, contact_rows=contact_rows)

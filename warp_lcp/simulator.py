@@ -358,8 +358,8 @@ class Simulator:
             self.launch(kernel, [self.topology, self.bodies, first, h, self.slots], number)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
-        rows = [*scene, self.bodies, self.slots, h, *self.law.row_arguments, self.rows]
-        self.launch(k.contact_rows, rows, self.model.max_contacts)
+        lanes = 1 if self.device.is_cpu else self.model.max_contacts
+        self.launch(k.contact_rows, [*scene, self.bodies, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
         if self.bounces is not None:
             self.launch(
                 k.bounce, [*scene, h, self.tolerance, int(self.integrator == "midpoint"), self.rows, self.bounces], self.model.max_contacts
