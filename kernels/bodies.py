@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .types import FIXED, FREE, scalar_types
+from .types import FIXED, FREE, OPTIONS, scalar_types
 
 NEWTON_ITERATIONS = wp.constant(8)
 
@@ -45,7 +45,7 @@ def make(real) -> SimpleNamespace:
             result = w + h * (wp.inverse(inertia) * torque)
         return result
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def kinematics(q: wp.array2d(dtype=real), v: wp.array2d(dtype=real), topology: Topology, bodies: Bodies, stride: int):
         start, b = wp.tid()
         for env in range(start, q.shape[0], stride):
@@ -67,7 +67,7 @@ def make(real) -> SimpleNamespace:
             bodies.pose[env, b] = pose
             bodies.velocity[env, b] = velocity
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def free_motion(
         topology: Topology,
         parameters: Parameters,

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .collide import NO_POINT, pair_functions
-from .types import scalar_types
+from .types import OPTIONS, scalar_types
 
 # Of the smallest half extent: boxes that overlap by no more along an axis count as touching, which is how soft ones rest.
 TOUCHING = wp.constant(0.1)
@@ -321,7 +321,7 @@ def make(real):
             result = bodies.inv_mass[env, body]
         return result
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def box_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, index = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):

@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from .collide import NO_POINT, pair_functions
-from .types import scalar_types
+from .types import OPTIONS, scalar_types
 
 # Of the radius: a segment that strays from a side by less than this runs along it. The distance it misses is the square
 # of it over twice the radius, less than what "covered" allows.
@@ -213,7 +213,7 @@ def make(real) -> dict:
             b = bend(distance, n, closing, motion.distance, motion.normal)
             write_bent(slots, env, slot, p - n * (radius + real(0.5) * gap), n, gap, b, feature)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def plane_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
@@ -228,7 +228,7 @@ def make(real) -> dict:
                 point = centre - normal * (size[0] + real(0.5) * gap)
                 write(slots, env, topology.pair_slots[pair] + k, point, normal, gap, 0)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def sphere_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
@@ -370,7 +370,7 @@ def make(real) -> dict:
         else:
             in_edge(slots, env, slot, box, size, c, e, half, r, normal, axis - 3)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def box_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
@@ -405,7 +405,7 @@ def make(real) -> dict:
                 else:
                     inside_box(slots, env, slot, box, size, c, e, half, r, near)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def capsule_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):

@@ -17,7 +17,7 @@ import functools
 import warp as wp
 
 from . import friction, rigid
-from .types import NOT_A_NUMBER, OPEN, SLIDE, STICK, UNCERTIFIED, scalar_types
+from .types import NOT_A_NUMBER, OPEN, OPTIONS, SLIDE, STICK, UNCERTIFIED, scalar_types
 
 # Residual of an answer that is not a number.
 HUGE = wp.constant(1.0e30)
@@ -46,7 +46,7 @@ def make(real):
                 state = SLIDE
         return state
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def certify(
         bodies: Bodies,
         h: real,

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .types import scalar_types
+from .types import OPTIONS, scalar_types
 
 NO_POINT = wp.constant(1.0e30)
 # Cosine: directions from faces of a box that are square to each other, rotated to world axes, agree by less than this.
@@ -115,7 +115,7 @@ def make(real) -> dict:
     shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
     outside_box, bend = f.outside_box, f.bend
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def plane_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
@@ -128,7 +128,7 @@ def make(real) -> dict:
             point = centre - normal * (radius + real(0.5) * gap)
             write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def plane_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
@@ -160,7 +160,7 @@ def make(real) -> dict:
                 else:
                     slots.gap[env, slot + k] = real(NO_POINT)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def sphere_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
@@ -181,7 +181,7 @@ def make(real) -> dict:
             left = bend(distance, normal, h * u, wp.length(ahead), ahead)
             write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, left, 0)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def sphere_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):

@@ -6,7 +6,7 @@ import functools
 import warp as wp
 
 from . import friction, proximal, rigid
-from .types import DISC, ITERATION_LIMIT, LANES, UNCERTIFIED, scalar_types, sync
+from .types import BLOCK_OPTIONS, DISC, ITERATION_LIMIT, UNCERTIFIED, scalar_types, sync
 
 
 @functools.cache
@@ -94,7 +94,7 @@ def make(real):
                 projected = vec3(normal, mu * normal * x[1] / size, mu * normal * x[2] / size)
         return p - projected
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def solve_contacts(
         W: wp.array3d(dtype=real),
         q: wp.array2d(dtype=real),
@@ -238,7 +238,7 @@ def make_contacts(real):
                             total -= block
         return frame[env, i] * total * wp.transpose(frame[env, j])
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def proximal_contacts(
         bodies: Bodies,
         contacts: Contacts,

@@ -16,7 +16,7 @@ import warp as wp
 
 from . import rigid
 from .collide import NO_POINT, pair_functions
-from .types import CONE, DISC, FACETS, FREE, OVERFLOW, REGULARIZED, scalar_types
+from .types import CONE, DISC, FACETS, FREE, OPTIONS, OVERFLOW, REGULARIZED, scalar_types
 
 # Overlaps that no load explains are pushed apart no faster than this [m/s], whatever the stiffness.
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
@@ -226,7 +226,7 @@ def make(real) -> SimpleNamespace:
     point_velocity, direction_mobility = f.point_velocity, f.direction_mobility
     shape_pose = pair_functions(real).shape_pose
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def combine_pairs(topology: Topology, parameters: Parameters):
         """Friction and contact parameters of every pair: the mean of its two shapes' materials, or Table 1."""
         i, pair = wp.tid()
@@ -248,7 +248,7 @@ def make(real) -> SimpleNamespace:
             c_b[k] = parameters.contact[i % parameters.contact.shape[0], b, k]
         parameters.pair_contact[i, pair] = contact_parameters(c_a, c_b, mass)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def select_contacts(
         topology: Topology,
         parameters: Parameters,
@@ -296,7 +296,7 @@ def make(real) -> SimpleNamespace:
                             status[env] = status[env] | OVERFLOW
             contacts.count[env] = count
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def contact_rows(
         topology: Topology,
         parameters: Parameters,

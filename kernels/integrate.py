@@ -13,7 +13,7 @@ import warp as wp
 
 from . import rigid
 from .contacts import ELASTIC_RANGE
-from .types import FIXED, FREE, scalar_types
+from .types import FIXED, FREE, OPTIONS, scalar_types
 
 
 @functools.cache
@@ -39,7 +39,7 @@ def make(real) -> SimpleNamespace:
         offset = wp.quat_rotate(turn, wp.transform_get_translation(pose) - com)
         return transform(com + h * velocity + offset, wp.normalize(turn * wp.transform_get_rotation(pose)))
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def integrate(
         topology: Topology,
         bodies: Bodies,
@@ -64,7 +64,7 @@ def make(real) -> SimpleNamespace:
             for k in range(6):
                 v[env, j + k] = velocity[k]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def guard(
         parameters: Parameters,
         bodies: Bodies,
@@ -115,7 +115,7 @@ def make(real) -> SimpleNamespace:
                             if b >= 0:
                                 bodies.velocity[env, b] = next_velocity[env, b]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def integrate_midpoint(
         topology: Topology,
         parameters: Parameters,

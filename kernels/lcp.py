@@ -24,7 +24,7 @@ import warp as wp
 
 from . import linear, problem
 from .solve_batch import solver
-from .types import ITERATION_LIMIT, LANES, scalar_types, sync
+from .types import BLOCK_OPTIONS, ITERATION_LIMIT, scalar_types, sync
 
 
 @functools.cache
@@ -314,7 +314,7 @@ def make(real, method: str, generators: bool = False):
     LcpWorkspace = problem.functions(real).LcpWorkspace
     solve = solver(real, method)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def assembled_lcp(
         bodies: Bodies,
         contacts: Contacts,

@@ -11,7 +11,7 @@ import functools
 import warp as wp
 
 from . import friction, rigid
-from .types import ITERATION_LIMIT, scalar_types
+from .types import ITERATION_LIMIT, OPTIONS, scalar_types
 
 
 @functools.cache
@@ -42,7 +42,7 @@ def make(real):
                 u += real(2 * side - 1) * point_velocity(velocity[env, b] - free[env, b], point - com[env, b])
         return u
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def pgs(
         bodies: Bodies,
         contacts: Contacts,

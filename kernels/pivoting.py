@@ -33,7 +33,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import sparse
-from .types import LANES, scalar_types, sync
+from .types import BLOCK_OPTIONS, OPTIONS, scalar_types, sync
 
 # State of a contact while it is solved: bit 0 closed, bits 1-2 axis t1, bits 3-4 axis t2.
 CLOSED = wp.constant(1)
@@ -290,7 +290,7 @@ def make_single(real, cone: bool, frozen: bool):
             b[k] = x * p[k]
         return b
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def pivot_single(
         bodies: Bodies,
         body: int,
@@ -551,7 +551,7 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
             u = vec3(x[0], x[1], x[2]) + wp.cross(vec3(x[3], x[4], x[5]), point - com[env, body])
         return u
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def pivot(
         bodies: Bodies,
         contacts: Contacts,

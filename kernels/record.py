@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .types import scalar_types
+from .types import OPTIONS, scalar_types
 
 
 @functools.cache
@@ -34,7 +34,7 @@ def make(real) -> SimpleNamespace:
         residual: wp.array2d(dtype=real)  # [T, E] m/s
         residual_energy: wp.array2d(dtype=real)  # [T, E] J
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def apply_wrench(tape: wp.array(dtype=Tape), step: wp.array2d(dtype=int), wrench: wp.array2d(dtype=spatial), stride: int):
         """Wrenches of this step; launch with dim (E, B)."""
         start, b = wp.tid()
@@ -42,7 +42,7 @@ def make(real) -> SimpleNamespace:
         for env in range(start, wrench.shape[0], stride):
             wrench[env, b] = source[step[start, 0], env % source.shape[1], b]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def record_row(
         tape: wp.array(dtype=Tape),
         step: wp.array2d(dtype=int),
@@ -97,7 +97,7 @@ def make(real) -> SimpleNamespace:
                 status[env] = 0
                 iterations[env] = 0
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def add_seen(
         seen_status: wp.array(dtype=int),
         seen_iterations: wp.array(dtype=int),

@@ -5,7 +5,7 @@ import functools
 
 import warp as wp
 
-from .types import scalar_types
+from .types import OPTIONS, scalar_types
 
 
 @functools.cache
@@ -15,7 +15,7 @@ def make(real):
     Contacts, Slots = t.Contacts, t.Slots
     spatial = t.spatial
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def reset(
         mask: wp.array(dtype=wp.bool),
         q0: wp.array2d(dtype=real),

@@ -23,7 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .types import RESTITUTION_REDUCED, SLIDE, scalar_types
+from .types import OPTIONS, RESTITUTION_REDUCED, SLIDE, scalar_types
 
 # A contact bounces where it approaches faster than this times the speed that the step adds to its approach (|g| h at least).
 # Slower ones would never come to rest; a ball does so with 0.5 and more (theory.md).
@@ -65,7 +65,7 @@ def make(real) -> SimpleNamespace:
         todo: wp.array(dtype=int)  # [E] environments that have to be solved again...
         again: wp.array(dtype=int)  # [1] ... and their number
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def bounce(
         topology: Topology,
         parameters: Parameters,
@@ -175,7 +175,7 @@ def make(real) -> SimpleNamespace:
             if state[env, i] == SLIDE:
                 state[env, i] = 3
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def judge(
         attempt: int,
         h: real,
@@ -277,7 +277,7 @@ def make(real) -> SimpleNamespace:
                 reason[env] = 0
                 set_theta(contacts.shift, contacts.free, contacts.state, bounces.kick, env, count, after - theta)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def settle(contacts: Contacts, bounces: Bounces, status: wp.array(dtype=int), stride: int):
         """When all environments are done: contacts and status as the other stages know them."""
         start, _ = wp.tid()

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from . import gauss_seidel, lemke, principal, problem
-from .types import LANES, NOT_A_NUMBER, UNCERTIFIED, sync
+from .types import BLOCK_OPTIONS, NOT_A_NUMBER, UNCERTIFIED, sync
 
 #: Functions (workspace, slot, n, limit, lane) -> (status bits, iterations), for a scalar type.
 SOLVERS: dict[str, Callable[[Any], Any]] = {
@@ -140,7 +140,7 @@ def make(real, method: str):
         load = load_with_rows
         shift = real(1.0)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options={"block_dim": LANES})
+    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def solve_batch(
         M: wp.array3d(dtype=real),
         q: wp.array2d(dtype=real),

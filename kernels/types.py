@@ -36,6 +36,10 @@ DISC = wp.constant(1)
 # Lanes of a block that works on one environment.
 LANES = 32
 
+# How modules are compiled: on the CPU products and sums are fused where it can (4 to 5 % of a step), as on a GPU.
+OPTIONS = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast"}
+BLOCK_OPTIONS = {**OPTIONS, "block_dim": LANES}
+
 # How a sliding contact is discretised (warp_lcp.Simulator, `sliding`). FACETS keeps the set it sticks with.
 REGULARIZED = wp.constant(0)
 ALIGNED = wp.constant(1)
