@@ -438,23 +438,17 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
                         ws.begin[slot, b + 1] = ws.begin[slot, b + 1] + 1
             for b in range(n):
                 ws.begin[slot, b + 1] = ws.begin[slot, b + 1] + ws.begin[slot, b]
-            for ii in range(r):
-                i = r - 1 - ii
+            for i in range(r):
                 for side in range(2):
                     b = node(ws.number, body[env, i][side])
                     if b >= 0:
-                        last = ws.begin[slot, b + 1] - 1
-                        ws.begin[slot, b + 1] = last
-                        ws.contact[slot, last] = i
-            # begin[b + 1] has come down to where body b begins
-            for b in range(n):
-                ws.begin[slot, b] = ws.begin[slot, b + 1]
-            total = int(0)
-            for i in range(r):
-                for side in range(2):
-                    if node(ws.number, body[env, i][side]) >= 0:
-                        total += 1
-            ws.begin[slot, n] = total
+                        e = ws.begin[slot, b]
+                        ws.contact[slot, e] = i
+                        ws.begin[slot, b] = e + 1
+            # Now begin[b] is where body b ends, which is where the next one begins.
+            for bb in range(n):
+                ws.begin[slot, n - bb] = ws.begin[slot, n - bb - 1]
+            ws.begin[slot, 0] = 0
         sync()
 
     @wp.func
