@@ -2,6 +2,7 @@
 """The command line: what info lists, what run writes, and that bad input ends with one clear line."""
 
 import builtins
+import functools
 import json
 import os
 import signal
@@ -391,7 +392,10 @@ def test_ctrl_c_leaves_readable_files(tmp_path):
     reader = pytest.importorskip("rerun.chunk").RrdReader
     rows, recording = tmp_path / "rows.npz", tmp_path / "run.rrd"
     command = [sys.executable, "-m", "warp_lcp", "run", "sphere_slip_roll", "--device", "cpu", "--duration", "1000", "--every", "10"]
-    process = subprocess.Popen([*command, "--rerun", recording, "--out", rows], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    # A shell starts what runs in its background with Ctrl-C ignored, and that would be inherited.
+    heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    command += ["--rerun", str(recording), "--out", str(rows)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, preexec_fn=heed)
     deadline = time.monotonic() + 60.0
     while not (recording.exists() and recording.stat().st_size > 100_000) and time.monotonic() < deadline:
         time.sleep(0.05)
