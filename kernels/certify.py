@@ -42,7 +42,7 @@ def make(real):
             state = STICK
             pressed = vec2(p[1], p[2]) * (real(1.0) + real(1.0e-6))  # not real(1.0 + ...): literals add up in single precision
             inside = project_friction(pressed, mu * p[0] + bound, k) - pressed
-            if k > 0 and wp.dot(inside, inside) > real(0.0):
+            if k != 0 and wp.dot(inside, inside) > real(0.0):
                 state = SLIDE
         return state
 
@@ -95,6 +95,7 @@ def make(real):
 
                 worst = real(0.0)
                 energy = real(0.0)
+                finite = bool(True)
                 for i in range(r):
                     p = contacts.impulse[env, i]
                     eps = contacts.relaxation[env, i]
@@ -111,10 +112,10 @@ def make(real):
                     w = weigh(contacts.inv_mass[env, i] + eps, k)
                     error = law_error(relaxed, p, w, mu, bound, k)
                     worst = wp.max(worst, wp.max(wp.abs(error)))
+                    finite = finite and wp.isfinite(error)  # a maximum passes over what is not a number
                     energy += real(0.5) * wp.dot(wp.cw_div(error, w), error)
                     contacts.velocity[env, i] = relaxed - wp.cw_mul(eps, p) - contacts.shift[env, i]
                     contacts.state[env, i] = contact_state(p, mu, bound, k)
-                finite = bool(True)
                 for b in range(next_velocity.shape[1]):
                     next_velocity[env, b] = bodies.free_velocity[env, b] + next_velocity[env, b]
                     finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
@@ -122,7 +123,7 @@ def make(real):
                     worst = real(HUGE)
 
                 # Of several uncertified answers the best one is applied; the first of them is no impulse at all.
-                if worst > tolerance and not restored:
+                if not worst <= tolerance and not restored:
                     if attempt == 0:
                         best_residual[env] = real(0.0)
                         for i in range(r):

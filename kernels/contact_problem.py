@@ -6,7 +6,7 @@ import functools
 import warp as wp
 
 from . import friction, proximal, rigid
-from .types import BLOCK_OPTIONS, DISC, ITERATION_LIMIT, UNCERTIFIED, scalar_types, sync
+from .types import BLOCK_OPTIONS, DISC, ITERATION_LIMIT, NOT_A_NUMBER, UNCERTIFIED, scalar_types, sync
 
 
 @functools.cache
@@ -124,7 +124,7 @@ def make(real):
             wp.atomic_max(sizes, problem, 1, largest[1])
             analyse(g, slot, n, lane)  # there is room: the workspace is made for n
             load(g, c, slot, n, W, q, mu, directions, problem, lane)
-            result = proximal_newton(g, c, slot, n, real(0.01) * tolerance, real(1.0e30), sweeps, newton_limit, lane)
+            result = proximal_newton(g, c, slot, n, real(0.01) * tolerance, real(wp.inf), sweeps, newton_limit, lane)
             # Everything below from W, q, mu and p alone, with W as it was given.
             for i in range(lane, n, wp.block_dim()):
                 u = c.free[slot, i]
@@ -148,10 +148,12 @@ def make(real):
                 distance = real(0.0)
                 square = real(0.0)
                 energy = real(0.0)
+                sound = bool(True)  # a maximum passes over what is not a number
                 for i in range(n):
                     p = c.impulse[slot, i]
                     free = c.free[slot, i]
                     u = c.velocity[slot, i]
+                    sound = sound and wp.isfinite(u) and wp.isfinite(p) and c.mu[slot, i][0] >= real(0.0)
                     largest_sum = wp.max(largest_sum, c.error[slot, i])
                     k = c.directions[slot, i]
                     diagonal = wp.get_diag(g.diagonal[slot, i])
@@ -178,7 +180,9 @@ def make(real):
                 iterations[problem] = result[1]
                 status[problem] = 0
                 # No residual is known better than the round-off of W p.
-                if not worst <= tolerance * size + round_off * largest_sum:
+                if not sound:
+                    status[problem] = NOT_A_NUMBER | UNCERTIFIED
+                elif not worst <= tolerance * size + round_off * largest_sum:
                     status[problem] = result[0] | UNCERTIFIED
             sync()
 
@@ -206,7 +210,6 @@ def make_contacts(real):
                 if j != i:
                     for x in range(2):
                         b = body[env, i][x]
-                        # Warp evaluates both sides of an `and`, so the index is checked on its own.
                         if b >= 0:  # noqa: SIM102
                             if inv_mass[env, b] > real(0.0) and (body[env, j][0] == b or body[env, j][1] == b):
                                 connect(g, slot, i, j)

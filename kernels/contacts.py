@@ -161,6 +161,7 @@ def row_functions(real) -> SimpleNamespace:
         mu_row = vec2(mu, mu)
         k = directions
         lateral = eps_t
+        load = mu * wp.max(impulse, real(IMPULSE_FLOOR) * weight)  # zero where neither gravity nor motion presses: no eq. 43
         # t1 lies along the slip, or along the slip to come: there the limit of a sticking contact is mu_s lambda_n exactly.
         along = slip
         if not slides:
@@ -172,13 +173,14 @@ def row_functions(real) -> SimpleNamespace:
         if slides:
             if sliding == FACETS or sliding == CONE:  # noqa: SIM109
                 d_t = vec3()  # the direction of friction is that of the slip alone
-                lateral = wp.max(eps_t, speed / (mu * wp.max(impulse, real(IMPULSE_FLOOR) * weight)))
+                if load > real(0.0):
+                    lateral = wp.max(eps_t, speed / load)
             else:
                 # Eq. 34, and eq. 43 across the sliding direction.
                 d_t = t1 * wp.dot(t1, d_t)
                 k = 2
-                if sliding == REGULARIZED and mu > real(0.0):
-                    eps[2] = wp.max(eps_t, speed / (mu * wp.max(impulse, real(IMPULSE_FLOOR) * weight)))
+                if sliding == REGULARIZED and load > real(0.0):
+                    eps[2] = wp.max(eps_t, speed / load)
                 else:
                     mu_row[1] = real(0.0)
         if mu == real(0.0):
@@ -310,7 +312,7 @@ def make(real) -> SimpleNamespace:
         lanes: int,
         stride: int,
     ):
-        """Rows of the selected contacts; velocity and free hold world axes before, the contact frame after."""
+        """Rows of the selected contacts; free holds world axes before, the contact frame after."""
         start, lane = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
             for i in range(lane, contacts.count[env], lanes):

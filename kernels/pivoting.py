@@ -235,11 +235,13 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
         turned = slip
         again = bool(False)
         if wp.static(cone):
-            p = cone_impulse(relaxed, eps, mu[0], state)
             if k != 0:
+                p = cone_impulse(relaxed, eps, mu[0], state)
                 after, turned, again = next_cone(relaxed, eps, w, mu[0], state, slip, tolerance)
             else:
-                after = next_closed(relaxed[0], eps[0], w[0], state, tolerance)
+                if (state & CLOSED) != 0:
+                    p[0] = wp.max(-relaxed[0] / eps[0], real(0.0))
+                after = next_closed(relaxed[0], eps[0], w[0], state, tolerance) | (state & 30)
                 again = after != state
         else:
             p = state_impulse(relaxed, eps, mu, bound, k, state)

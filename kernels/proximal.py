@@ -114,7 +114,7 @@ def functions(real) -> SimpleNamespace:
         return wp.sqrt(total)
 
     @wp.func
-    def movement(c: ContactProblem, slot: int, n: int, lane: int) -> real:
+    def movement(c: ContactProblem, slot: int, n: int) -> real:
         """|p - c| / |p|, both weighed as F is; 0 where p and c are."""
         total = real(0.0)
         size = real(0.0)
@@ -213,6 +213,7 @@ def functions(real) -> SimpleNamespace:
             size += wp.dot(c.free[slot, i], wp.cw_mul(c.rho[slot, i], c.free[slot, i]))
         for i in range(lane, n, wp.block_dim()):
             c.centre[slot, i] = vec3(real(1.0e30))  # none yet
+            c.best[slot, i] = vec3()
         sync()
         target = target * wp.sqrt(size)
         least = real(1.0e30)
@@ -237,7 +238,7 @@ def functions(real) -> SimpleNamespace:
         while searching:
             # Each function is called in one place: Warp's compilers inline them all.
             steps += gauss_seidel(g, c, slot, n, share, todo, real(0.1) * target, lane)
-            moved = movement(c, slot, n, lane)
+            moved = movement(c, slot, n)
             error = settle(g, c, slot, n, share, lane)
             if slow or (inner > FEW and error > real(0.5) * before):
                 other = gamma
@@ -253,7 +254,7 @@ def functions(real) -> SimpleNamespace:
                 sync()
             at_end = least < real(100.0) * target and stalls >= MOST_STALLS_AT_END
             done = error <= target and (moved <= rest or stalls >= MOST_STALLS_AT_END)  # p may move by round-off
-            failed = not done and (steps >= most or stalls >= MOST_STALLS or at_end)
+            failed = not done and (limit == 0 or steps >= most or stalls >= MOST_STALLS or at_end)
             if done and (stage == 0 or stage == STAGES):
                 searching = False
             elif failed and (stage == STAGES or at_end or not rubs or limit == 0):

@@ -246,3 +246,23 @@ def test_recorded_problems_with_facets(formulation, k):
     for path in RECORDED:
         s = wl.solve_contact(*load(path), formulation, directions=k, device="cpu")
         assert ok(s), path.stem
+
+
+def test_what_is_not_a_number_is_never_solved(monkeypatch, heap):
+    """On a GPU arrays are not read back, so the kernel itself has to say so: here without the check of the host."""
+    import warp_lcp.friction_problem as module
+
+    W, q, mu = heap
+    monkeypatch.setattr(module, "check_finite", lambda *_: None)
+    wrong_q, wrong_mu = q.copy(), mu.copy()
+    wrong_q[4], wrong_mu[3] = np.nan, np.nan
+    for problem in ((W, wrong_q, mu), (W, q, wrong_mu)):
+        s = wl.solve_contact(*problem, device="cpu")
+        assert s.status.numpy()[0] & wl.Status.NOT_A_NUMBER
+    assert ok(wl.solve_contact(W, q, mu, device="cpu"))  # the workspace is kept: nothing of it is left
+
+
+@pytest.mark.parametrize("tolerance", [-1.0, 0.0, np.nan])
+def test_tolerance_is_checked(tolerance):
+    with pytest.raises(wl.WarpLcpError, match=r"tolerance is .*; it must be greater than zero"):
+        wl.solve_contact(np.eye(3), np.zeros(3), 0.5, tolerance=tolerance, device="cpu")

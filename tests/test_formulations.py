@@ -161,3 +161,39 @@ def test_lcps_of_all_laws(formulation, method):
 def test_a_method_that_does_not_take_a_law_says_so(options, message):
     with pytest.raises(wl.WarpLcpError, match=message):
         simulator(paper_box(), **options)
+
+
+@pytest.mark.parametrize("method", ["auto", "velocity_pivoting", "proximal_newton"])
+def test_a_frictionless_contact_on_the_cone(method):
+    """mu = 0: a block keeps its speed and stays on the plane."""
+    sim = simulator(block_on_plane(0.0, half=(0.5, 0.5, 0.05), velocity=(1.0, 0.0, 0.0)), dt=5e-3, formulation="coulomb", method=method)
+    sim.step(100)
+    np.testing.assert_allclose(sim.v.numpy()[0], [1, 0, 0, 0, 0, 0], atol=1e-9)
+    assert sim.status.numpy()[0] == 0
+
+
+@pytest.mark.parametrize("formulation", ["coulomb", "hybrid", "phantom_inertia"])
+def test_weightless_sliding_and_then_pressed(formulation):
+    """Without gravity nothing presses a block that slides along a plane: it keeps its velocity, and no history of it is left that is not a
+    number. Pressed with 10 N friction is mu 10 N against the slip and nothing across it."""
+    sim = simulator(block_on_plane(MU, (0, 0, 0), half=(0.5, 0.5, 0.05), velocity=(2.0, 0.0, 0.0)), dt=5e-3, formulation=formulation)
+    sim.step(20)
+    np.testing.assert_allclose(sim.v.numpy()[0], [2, 0, 0, 0, 0, 0], atol=1e-12)
+    assert np.isfinite(sim.slots.last_bristle.numpy()).all()
+    wrench = np.zeros((1, 1, 6))
+    wrench[..., 2] = -10.0
+    sim.wrench.assign(wrench)
+    sim.step(100)
+    mass = float(sim.model.mass[0])
+    v = sim.v.numpy()[0]
+    # The first step of a frozen limit knows no force yet: one step's worth of speed.
+    assert v[0] == pytest.approx(2.0 - MU * 10.0 / mass * 0.5, abs=MU * 10.0 / mass * 5e-3 * 1.001 + 1e-9)
+    assert abs(v[1]) < 1e-9
+    assert sim.status.numpy()[0] == 0
+
+
+@pytest.mark.parametrize("formulation", ["anitescu_potra", "box", "coulomb", "hybrid", "phantom_inertia"])
+def test_sliding_contacts_are_reported_as_sliding(formulation):
+    sim = simulator(block_on_plane(MU, half=(0.5, 0.5, 0.05), velocity=(2.0, 0.0, 0.0)), dt=5e-3, formulation=formulation)
+    sim.step(5)
+    assert (sim.contacts.state.numpy()[0, :4] == 2).all()

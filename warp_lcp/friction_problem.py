@@ -20,7 +20,7 @@ from .methods import contact_workspace, workspaces
 FORMULATIONS = ("coulomb", "phantom_inertia", "anitescu_potra")
 #: Contacts of a problem whose workspace is kept for the next one of its size (CPU).
 SMALL = 64
-#: Sweeps of block Gauss-Seidel and factorisations of Newton's method, at most.
+#: Sweeps of block Gauss-Seidel and factorisations of Newton's method, at most, in the first attempt (kernels/proximal.py).
 METHODS = {"auto": (20, 400), "proximal_newton": (20, 400), "pgs": (10_000, 0)}
 
 
@@ -119,6 +119,8 @@ def prepare(
         W, q = W.reshape((1, *W.shape)), q.reshape((1, *q.shape))
     batch, contacts = q.shape[0], q.shape[1] // 3
     mu = _coefficients(mu, batch, contacts, real, device)
+    if tolerance is not None and not tolerance > 0.0:
+        raise WarpLcpError(f"{me}: tolerance is {tolerance}; it must be greater than zero")
     if tolerance is None:
         tolerance = 1e-10 if real is wp.float64 else 1e-4
     code = {"coulomb": 1, "phantom_inertia": directions, "anitescu_potra": -directions}[formulation]
@@ -152,6 +154,7 @@ def _coefficients(mu: Any, batch: int, contacts: int, real: Any, device: Any) ->
     mu = np.asarray(mu.numpy() if isinstance(mu, wp.array) else mu, dtype=float)
     if mu.shape not in ((), (contacts,), (batch, contacts)):
         raise WarpLcpError(f"solve_contact: mu has shape {mu.shape}; give {(batch, contacts)}, {(contacts,)} or one number")
+    check_finite("solve_contact", "mu", mu)
     if (mu < 0.0).any():
         where = [int(i) for i in np.argwhere(mu < 0.0)[0]]
         raise WarpLcpError(f"solve_contact: mu{where or ''} is {mu[tuple(where)]}; it must not be negative")

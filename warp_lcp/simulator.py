@@ -166,6 +166,7 @@ class Simulator:
         """Advance every environment by ``count`` steps (0 only prepares)."""
         if int(count) != count or count < 0:
             raise WarpLcpError(f"step: count is {count}; give a whole number of at least 0")
+        count = int(count)
         graph = self._captured("step", self._step_kernels)
         self.status.zero_()
         self.iterations.zero_()
