@@ -193,13 +193,13 @@ def make(real):
 def make_contacts(real):
     """Kernel ``proximal_contacts`` for the rows of environments; launch tiled with dim (P)."""
     t = scalar_types(real)
-    vec3, mat33 = t.vec3, t.mat33
+    vec3 = t.vec3
     Bodies, Contacts = t.Bodies, t.Contacts
     f = proximal.functions(real)
     Graph, ContactProblem = f.Graph, f.ContactProblem
     clear, connect, analyse, proximal_newton = f.clear, f.connect, f.analyse, f.proximal_newton
     weigh = friction.functions(real).weigh
-    mobility = rigid.functions(real).mobility
+    delassus = rigid.functions(real).delassus
 
     @wp.func
     def couple(g: Graph, slot: int, n: int, body: wp.array2d(dtype=wp.vec2i), inv_mass: wp.array2d(dtype=real), env: int, lane: int):
@@ -214,32 +214,6 @@ def make_contacts(real):
                             if inv_mass[env, b] > real(0.0) and (body[env, j][0] == b or body[env, j][1] == b):
                                 connect(g, slot, i, j)
         sync()
-
-    @wp.func
-    def block_of(
-        body: wp.array2d(dtype=wp.vec2i),
-        point: wp.array2d(dtype=vec3),
-        frame: wp.array2d(dtype=mat33),
-        com: wp.array2d(dtype=vec3),
-        inv_mass: wp.array2d(dtype=real),
-        inv_inertia: wp.array2d(dtype=mat33),
-        env: int,
-        i: int,
-        j: int,
-    ) -> mat33:
-        """Block (i, j) of J M^-1 J^T, rows and columns n t1 t2."""
-        total = mat33()
-        for x in range(2):
-            b = body[env, i][x]
-            if b >= 0:
-                for y in range(2):
-                    if body[env, j][y] == b:
-                        block = mobility(inv_mass[env, b], inv_inertia[env, b], point[env, i] - com[env, b], point[env, j] - com[env, b])
-                        if x == y:
-                            total += block
-                        else:
-                            total -= block
-        return frame[env, i] * total * wp.transpose(frame[env, j])
 
     @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def proximal_contacts(
@@ -266,7 +240,7 @@ def make_contacts(real):
             if analyse(g, slot, n, lane):
                 for i in range(lane, n, wp.block_dim()):
                     for e in range(g.row[slot, i], g.row[slot, i + 1]):
-                        g.block[slot, e] = block_of(
+                        g.block[slot, e] = delassus(
                             contacts.body,
                             contacts.point,
                             contacts.frame,
@@ -277,7 +251,7 @@ def make_contacts(real):
                             i,
                             g.column[slot, e],
                         )
-                    w = block_of(
+                    w = delassus(
                         contacts.body, contacts.point, contacts.frame, bodies.com, bodies.inv_mass, bodies.inv_inertia, env, i, i
                     ) + wp.diag(contacts.relaxation[env, i])
                     g.diagonal[slot, i] = w

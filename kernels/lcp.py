@@ -22,7 +22,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import linear, problem
+from . import linear, problem, rigid
 from .solve_batch import solver
 from .types import BLOCK_OPTIONS, ITERATION_LIMIT, scalar_types, sync
 
@@ -31,10 +31,11 @@ from .types import BLOCK_OPTIONS, ITERATION_LIMIT, scalar_types, sync
 def functions(real) -> SimpleNamespace:
     """Workspace and the functions ``assemble`` and ``impulses``."""
     t = scalar_types(real)
-    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    vec2, vec3 = t.vec2, t.vec3
     Bodies, Contacts = t.Bodies, t.Contacts
     LcpWorkspace = problem.functions(real).LcpWorkspace
     invert = linear.functions(real).invert
+    delassus = rigid.functions(real).delassus
 
     @wp.struct
     class ContactWorkspace:
@@ -43,28 +44,6 @@ def functions(real) -> SimpleNamespace:
         G: wp.array3d(dtype=real)  # [P, 2 R, R + 1] A^-1 W_tn; last column A^-1 b_t
         friction: wp.array2d(dtype=int)  # [P, R + 1] index of the contact within A, -1 = frictionless; last: their number
         start: wp.array2d(dtype=int)  # [P, R + 1] first unknown of each contact; last: number of unknowns
-
-    @wp.func
-    def arm(bodies: Bodies, contacts: Contacts, env: int, i: int, body: int) -> mat33:
-        """[r] of a contact point about a body's centre of mass."""
-        return wp.skew(contacts.point[env, i] - bodies.com[env, body])
-
-    @wp.func
-    def delassus(bodies: Bodies, contacts: Contacts, env: int, i: int, j: int) -> mat33:
-        """Block (i, j) of J M^-1 J^T, rows and columns n t1 t2."""
-        mobility = mat33()
-        for x in range(2):
-            body = contacts.body[env, i][x]
-            if body >= 0:
-                for y in range(2):
-                    if contacts.body[env, j][y] == body:
-                        block = wp.diag(vec3(bodies.inv_mass[env, body]))
-                        block -= arm(bodies, contacts, env, i, body) * bodies.inv_inertia[env, body] * arm(bodies, contacts, env, j, body)
-                        if x == y:
-                            mobility += block
-                        else:
-                            mobility -= block
-        return contacts.frame[env, i] * mobility * wp.transpose(contacts.frame[env, j])
 
     @wp.func
     def direction(k: int, m: int) -> vec2:
@@ -98,7 +77,7 @@ def functions(real) -> SimpleNamespace:
         for ij in range(lane, r * r, wp.block_dim()):
             i = ij // r
             j = ij % r
-            block = delassus(bodies, contacts, env, i, j)
+            block = delassus(contacts.body, contacts.point, contacts.frame, bodies.com, bodies.inv_mass, bodies.inv_inertia, env, i, j)
             for a in range(3):
                 if i == j:
                     block[a, a] += contacts.relaxation[env, i][a]
@@ -258,7 +237,7 @@ def functions(real) -> SimpleNamespace:
             sj = ws.start[slot, j]
             ki = -contacts.directions[env, i]
             kj = -contacts.directions[env, j]
-            block = delassus(bodies, contacts, env, i, j)
+            block = delassus(contacts.body, contacts.point, contacts.frame, bodies.com, bodies.inv_mass, bodies.inv_inertia, env, i, j)
             if i == j:
                 block += wp.diag(contacts.relaxation[env, i])
             for a in range(ws.start[slot, i + 1] - si):
@@ -296,7 +275,6 @@ def functions(real) -> SimpleNamespace:
         impulses=impulses,
         assemble_generators=assemble_generators,
         generated_impulses=generated_impulses,
-        direction=direction,
     )
 
 

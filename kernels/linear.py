@@ -14,7 +14,7 @@ from .types import sync
 
 @functools.cache
 def functions(real) -> SimpleNamespace:
-    """``invert`` for symmetric positive definite matrices, ``solve`` and ``solve_deficient`` for general ones."""
+    """``invert`` for symmetric positive definite matrices, ``solve_deficient`` for general ones."""
 
     @wp.func
     def invert(a: wp.array3d(dtype=real), slot: int, n: int, lane: int):
@@ -87,9 +87,4 @@ def functions(real) -> SimpleNamespace:
         sync()
         return deficient
 
-    @wp.func
-    def solve(a: wp.array3d(dtype=real), slot: int, n: int, lane: int) -> bool:
-        """Solve A x = b as above; returns False where A is singular."""
-        return solve_deficient(a, slot, n, real(0.0), real(0.0), lane) == 0
-
-    return SimpleNamespace(invert=invert, solve=solve, solve_deficient=solve_deficient)
+    return SimpleNamespace(invert=invert, solve_deficient=solve_deficient)

@@ -44,6 +44,37 @@ def functions(real) -> SimpleNamespace:
         moment = wp.cross(arm, direction)
         return inv_mass + wp.dot(moment, inv_inertia * moment)
 
+    @wp.func
+    def delassus(
+        body: wp.array2d(dtype=wp.vec2i),
+        point: wp.array2d(dtype=vec3),
+        frame: wp.array2d(dtype=mat33),
+        com: wp.array2d(dtype=vec3),
+        inv_mass: wp.array2d(dtype=real),
+        inv_inertia: wp.array2d(dtype=mat33),
+        env: int,
+        i: int,
+        j: int,
+    ) -> mat33:
+        """Block (i, j) of J M^-1 J^T of the contacts of an environment, rows and columns n t1 t2."""
+        total = mat33()
+        for x in range(2):
+            b = body[env, i][x]
+            if b >= 0:
+                for y in range(2):
+                    if body[env, j][y] == b:
+                        block = mobility(inv_mass[env, b], inv_inertia[env, b], point[env, i] - com[env, b], point[env, j] - com[env, b])
+                        if x == y:
+                            total += block
+                        else:
+                            total -= block
+        return frame[env, i] * total * wp.transpose(frame[env, j])
+
     return SimpleNamespace(
-        point_velocity=point_velocity, wrench=wrench, response=response, mobility=mobility, direction_mobility=direction_mobility
+        point_velocity=point_velocity,
+        wrench=wrench,
+        response=response,
+        mobility=mobility,
+        delassus=delassus,
+        direction_mobility=direction_mobility,
     )

@@ -266,3 +266,14 @@ def test_what_is_not_a_number_is_never_solved(monkeypatch, heap):
 def test_tolerance_is_checked(tolerance):
     with pytest.raises(wl.WarpLcpError, match=r"tolerance is .*; it must be greater than zero"):
         wl.solve_contact(np.eye(3), np.zeros(3), 0.5, tolerance=tolerance, device="cpu")
+
+
+@pytest.mark.parametrize("seed", [22, 85, 172])
+def test_friction_let_in_by_degrees(seed):
+    """Hard problems (mu from 1 to 10, redundant) that Newton's method on all the friction at once does not solve."""
+    from benchmarks.friction.stress import generate
+
+    W, q, mu, _ = generate(seed)
+    s = wl.solve_contact(W, q, mu, device="cpu")
+    assert ok(s)
+    assert natural_map(W, q, mu, s.impulse.numpy()[0]) < 1e-8  # the round-off of W p at these mass ratios
