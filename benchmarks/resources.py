@@ -37,31 +37,40 @@ class Resources:
 
 
 def scenes() -> list[wl.Model]:
-    """A scene with one movable body, and one in which every pair of shapes can meet."""
-    single, many = wl.ModelBuilder(), wl.ModelBuilder()
-    single.add_plane(material=wl.Material(restitution=0.5))
-    single.add_box(single.add_body(), (0.1, 0.1, 0.1))
+    """A scene with one movable body, the same with restitution, and one in which every pair of shapes can meet."""
+    made = []
+    for e in (0.0, 0.5):
+        single = wl.ModelBuilder()
+        single.add_plane(material=wl.Material(restitution=e))
+        single.add_box(single.add_body(), (0.1, 0.1, 0.1))
+        made.append(single.finalize())
+    many = wl.ModelBuilder()
     many.add_plane()
     for _ in range(2):
         many.add_box(many.add_body(), (0.1, 0.1, 0.1))
         many.add_sphere(many.add_body(), 0.1)
         many.add_capsule(many.add_body(), 0.1, 0.1)
-    return [single.finalize(), many.finalize()]
+    return [*made, many.finalize()]
 
 
 def kernels(precision: str) -> dict[str, wp.Kernel]:
-    """Every kernel of one precision by its name; those that a method is built into as name[method]."""
+    """Every kernel of one precision by its name; a kernel's instances after the first as name[what it is built for]."""
     real = PRECISIONS[precision][0]
     found = {"collect_status": watch.collect_status, "solve_contacts": contact_problem.make(real)}
     found |= {name: part for name, part in vars(record.make(real)).items() if isinstance(part, wp.Kernel)}
     found |= {f"solve_batch[{method}]": solve_batch.make(real, method) for method in solve_batch.SOLVERS}
     found |= {f"assembled_lcp[{method}]": lcp.make(real, method) for method in ("lemke", "murty", "judice_pires")}
+    generators = ("lemke", "murty", "judice_pires")
+    found |= {f"assembled_lcp[{method}, anitescu_potra]": lcp.make(real, method, True) for method in generators}
     for model in scenes():
+        bounces = "restitution" if model.restitution.any() else ""
         options = [{"method": m} for m in METHODS if precision == "float64" or m != "velocity_pivoting"]
-        for option in (*options, {"method": "pgs", "integrator": "midpoint"}):
+        laws = [{"formulation": law} for law in ("coulomb", "hybrid")]
+        for option in (*options, {"method": "pgs", "integrator": "midpoint"}, *laws):
             for kernel in wl.Simulator(model, precision=precision, device="cpu", **option).kernels:
                 if kernel not in found.values():
-                    found[kernel.key.split("__")[-1]] = kernel
+                    name, what = kernel.key.split("__")[-1], ", ".join(filter(None, (option.get("formulation"), bounces)))
+                    found[f"{name}[{what}]" if name in found else name] = kernel
     return found
 
 

@@ -13,6 +13,7 @@ residual is the largest of them; sum m r^2 / 2 is the unit-consistent energy err
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -24,15 +25,12 @@ HUGE = wp.constant(1.0e30)
 
 
 @functools.cache
-def make(real):
-    """Kernel ``certify``; launch with dim (E)."""
+def functions(real) -> SimpleNamespace:
+    """``judge`` and ``remember`` of one contact."""
     t = scalar_types(real)
-    vec2, vec3, spatial = t.vec2, t.vec3, t.spatial
-    Bodies, Contacts, Slots = t.Bodies, t.Contacts, t.Slots
+    vec2, vec3, mat33, Slots = t.vec2, t.vec3, t.mat33, t.Slots
     law = friction.functions(real)
     project_friction, weigh, law_error = law.project_friction, law.weigh, law.law_error
-    body = rigid.functions(real)
-    point_velocity, wrench, response = body.point_velocity, body.wrench, body.response
 
     @wp.func
     def contact_state(p: vec3, mu: vec2, bound: vec2, k: int) -> int:
@@ -45,6 +43,39 @@ def make(real):
             if k != 0 and wp.dot(inside, inside) > real(0.0):
                 state = SLIDE
         return state
+
+    @wp.func
+    def judge(u: vec3, p: vec3, eps: vec3, w: vec3, shift: vec3, mu: vec2, bound: vec2, k: int):
+        """Violation of the law [m/s], its energy [J], u+ and state of a contact; u = J v+ + d, w of J M^-1 J^T."""
+        relaxed = u + wp.cw_mul(eps, p)
+        weight = weigh(w + eps, k)
+        error = law_error(relaxed, p, weight, mu, bound, k)
+        energy = real(0.5) * wp.dot(wp.cw_div(error, weight), error)
+        return error, energy, u - shift, contact_state(p, mu, bound, k)
+
+    @wp.func
+    def remember(slots: Slots, env: int, slot: int, rate: real, frame: mat33, p: vec3, u: vec3, b_t: real):
+        """History for the next step: the feature that touched, its normal impulse and bristle force (eq. 42); rate = 1 / h."""
+        bristle = vec3(real(0.0), p[1] * rate + b_t * u[1], p[2] * rate + b_t * u[2])
+        slots.last_feature[env, slot] = slots.feature[env, slot]
+        slots.last_impulse[env, slot] = p[0]
+        slots.last_bristle[env, slot] = wp.transpose(frame) * bristle
+
+    return SimpleNamespace(judge=judge, remember=remember)
+
+
+@functools.cache
+def make(real):
+    """Kernel ``certify``; launch with dim (E)."""
+    t = scalar_types(real)
+    vec3, spatial = t.vec3, t.spatial
+    Bodies, Contacts, Slots = t.Bodies, t.Contacts, t.Slots
+    law = friction.functions(real)
+    weigh, law_error = law.weigh, law.law_error
+    f = functions(real)
+    judge, remember = f.judge, f.remember
+    body = rigid.functions(real)
+    point_velocity, wrench, response = body.point_velocity, body.wrench, body.response
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def certify(
@@ -70,6 +101,7 @@ def make(real):
     ):
         """The answers of the environments todo[:number]; those that the next method is to solve go to `left`."""
         start, _ = wp.tid()
+        rate = real(1.0) / h
         for index in range(start, number[0], stride):
             env = todo[index]
             r = contacts.count[env]
@@ -98,24 +130,28 @@ def make(real):
                 finite = bool(True)
                 for i in range(r):
                     p = contacts.impulse[env, i]
-                    eps = contacts.relaxation[env, i]
                     du = vec3()
                     for side in range(2):
                         b = contacts.body[env, i][side]
                         if b >= 0:
                             arm = contacts.point[env, i] - bodies.com[env, b]
                             du += real(2 * side - 1) * point_velocity(next_velocity[env, b], arm)
-                    relaxed = contacts.free[env, i] + contacts.frame[env, i] * du + wp.cw_mul(eps, p)
-                    k = contacts.directions[env, i]
-                    mu = contacts.mu[env, i]
-                    bound = contacts.bound[env, i]
-                    w = weigh(contacts.inv_mass[env, i] + eps, k)
-                    error = law_error(relaxed, p, w, mu, bound, k)
+                    u = contacts.free[env, i] + contacts.frame[env, i] * du
+                    error, part, ended, state = judge(
+                        u,
+                        p,
+                        contacts.relaxation[env, i],
+                        contacts.inv_mass[env, i],
+                        contacts.shift[env, i],
+                        contacts.mu[env, i],
+                        contacts.bound[env, i],
+                        contacts.directions[env, i],
+                    )
                     worst = wp.max(worst, wp.max(wp.abs(error)))
                     finite = finite and wp.isfinite(error)  # a maximum passes over what is not a number
-                    energy += real(0.5) * wp.dot(wp.cw_div(error, w), error)
-                    contacts.velocity[env, i] = relaxed - wp.cw_mul(eps, p) - contacts.shift[env, i]
-                    contacts.state[env, i] = contact_state(p, mu, bound, k)
+                    energy += part
+                    contacts.velocity[env, i] = ended
+                    contacts.state[env, i] = state
                 for b in range(next_velocity.shape[1]):
                     next_velocity[env, b] = bodies.free_velocity[env, b] + next_velocity[env, b]
                     finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
@@ -157,19 +193,13 @@ def make(real):
                     status[env] = status[env] | NOT_A_NUMBER
 
             if solved or final != 0:
-                # History for the next step: which features touched, with what normal impulse and bristle force (eq. 42).
                 for slot in range(slots.last_feature.shape[1]):
                     slots.last_feature[env, slot] = -1
                 for i in range(r):
                     p = contacts.impulse[env, i]
                     # An unloaded contact is remembered as such; one that never closed will be new when it does.
                     if p[0] > real(0.0) or contacts.closed[env, i] != 0:
-                        slot = contacts.slot[env, i]
-                        u = contacts.velocity[env, i]
-                        b_t = contacts.damping[env, i]
-                        bristle = vec3(real(0.0), p[1] / h + b_t * u[1], p[2] / h + b_t * u[2])
-                        slots.last_feature[env, slot] = slots.feature[env, slot]
-                        slots.last_impulse[env, slot] = p[0]
-                        slots.last_bristle[env, slot] = wp.transpose(contacts.frame[env, i]) * bristle
+                        frame = contacts.frame[env, i]
+                        remember(slots, env, contacts.slot[env, i], rate, frame, p, contacts.velocity[env, i], contacts.damping[env, i])
 
     return certify

@@ -34,7 +34,10 @@ def row_functions(real) -> SimpleNamespace:
     """What a contact row is made of."""
     t = scalar_types(real)
     vec2, vec3, vec5, mat33 = t.vec2, t.vec3, t.vec5, t.mat33
+    Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     body = rigid.functions(real)
+    point_velocity, direction_mobility = body.point_velocity, body.direction_mobility
+    shape_pose = pair_functions(real).shape_pose
 
     @wp.struct
     class History:
@@ -47,8 +50,11 @@ def row_functions(real) -> SimpleNamespace:
     @wp.struct
     class Row:
         frame: mat33
+        inv_mass: vec3
         relaxation: vec3
         shift: vec3
+        free: vec3
+        damping: real
         mu: vec2
         bound: vec2
         lateral: real  # eq. 43 where Coulomb's cone is first linearised
@@ -83,6 +89,10 @@ def row_functions(real) -> SimpleNamespace:
     @wp.func
     def tangent_part(x: vec3, n: vec3) -> vec3:
         return x - n * wp.dot(n, x)
+
+    @wp.func
+    def unit(x: vec3) -> vec3:
+        return x * (real(1.0) / wp.length(x))
 
     @wp.func
     def any_axis(n: vec3) -> vec3:
@@ -140,22 +150,27 @@ def row_functions(real) -> SimpleNamespace:
             # Overlap that no load explains is pushed apart with the speed that gravity takes away until the surfaces are
             # clear, or it would stay in the bodies. Springs keep what they are owed.
             load = real(ELASTIC_RANGE) * wp.max(weight, impulse)
-            push = real(MAX_DEPENETRATION_SPEED)
-            if g > real(0.0):
-                depth = wp.max(-phi - load / (k_n * h), real(0.0))
-                fall = real(0.5) * g * h
-                push = wp.min(push, wp.sqrt(real(2.0) * g * depth + fall * fall) - fall)
-            d_n = wp.max(eps_n * h * k_n * phi, -eps_n * load - push)
+            spring = h * k_n * phi
+            if spring < -load:
+                push = real(MAX_DEPENETRATION_SPEED)
+                if g > real(0.0):
+                    depth = -phi - load / (k_n * h)
+                    fall = real(0.5) * g * h
+                    push = wp.min(push, wp.sqrt(real(2.0) * g * depth + fall * fall) - fall)
+                d_n = wp.max(eps_n * spring, -eps_n * load - push)
+            else:
+                d_n = eps_n * spring
 
         eps_t = real(1.0) / (k_t * h * h + b_t * h)
         if directions < 0:  # Anitescu and Potra: rigid friction, no bristles
             eps_t = real(0.0)
         slip = tangent_part(u, n)
-        speed = wp.length(slip)
-        slides = speed >= c[4]
+        slides = wp.length_sq(slip) >= c[4] * c[4]
+        speed = real(0.0)
         mu = friction[0]
         if slides:
             mu = friction[1]
+            speed = wp.length(slip)
         eps = vec3(eps_n, eps_t, eps_t)
         d_t = -(eps_t * h) * bristle  # eq. 42
         mu_row = vec2(mu, mu)
@@ -169,7 +184,7 @@ def row_functions(real) -> SimpleNamespace:
         aligned = slides or wp.length_sq(along) > real(NO_SLIP * NO_SLIP) * wp.length_sq(u_free)
         if sliding == FACETS or not aligned:
             along = any_axis(n)
-        t1 = wp.normalize(tangent_part(along, n))  # once more: a small slip is a difference of large numbers
+        t1 = unit(tangent_part(along, n))  # once more: a small slip is a difference of large numbers
         if slides:
             if sliding == FACETS or sliding == CONE:  # noqa: SIM109
                 d_t = vec3()  # the direction of friction is that of the slip alone
@@ -208,12 +223,90 @@ def row_functions(real) -> SimpleNamespace:
             row.state = row.state | 2
         return row
 
+    @wp.func
+    def velocities(topology: Topology, bodies: Bodies, env: int, pair: int, point: vec3):
+        """Present and free velocity of b relative to a at a point, world axes, moving surfaces included."""
+        u = vec3()
+        u_free = vec3()
+        body = topology.pair_body[pair]
+        for side in range(2):
+            sign = real(2 * side - 1)
+            shape = topology.pairs[pair, side]
+            b = body[side]
+            belt = topology.surface_velocity[shape]
+            if wp.dot(belt, belt) > real(0.0):
+                belt = sign * wp.transform_vector(shape_pose(topology, bodies, env, shape), belt)
+                u += belt
+                u_free += belt
+            if b >= 0:
+                arm = point - bodies.com[env, b]
+                u += sign * point_velocity(bodies.velocity[env, b], arm)
+                u_free += sign * point_velocity(bodies.free_velocity[env, b], arm)
+        return u, u_free
+
+    @wp.func
+    def mobility(bodies: Bodies, env: int, body: wp.vec2i, point: vec3, direction: vec3) -> real:
+        """J M^-1 J^T of a contact along a unit direction."""
+        w = real(0.0)
+        for side in range(2):
+            b = body[side]
+            if b >= 0:
+                w += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], point - bodies.com[env, b], direction)
+        return w
+
+    @wp.func
+    def read_row(
+        topology: Topology,
+        parameters: Parameters,
+        slots: Slots,
+        env: int,
+        slot: int,
+        w_nn: real,
+        u: vec3,
+        u_free: vec3,
+        h: real,
+        sliding: int,
+        directions: int,
+        frozen: int,
+    ) -> Row:
+        """Row of the contact at a slot, all but inv_mass; u, u_free: world axes."""
+        pair = topology.slot_pair[slot]
+        g = wp.length(parameters.gravity[env % parameters.gravity.shape[0]])
+        friction = parameters.pair_friction[env % parameters.pair_friction.shape[0], pair]
+        c = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair]
+        history = History()
+        history.touched = slots.last_feature[env, slot] == slots.feature[env, slot]
+        history.impulse = slots.last_impulse[env, slot]
+        history.bristle = slots.last_bristle[env, slot]
+        n = slots.normal[env, slot]
+        phi = slots.gap[env, slot]
+        row = make_row(w_nn, n, phi, slots.bend[env, slot], u, u_free, c, friction, history, g, h, sliding, directions, frozen)
+        row.free = row.frame * u_free + row.shift
+        row.damping = c[3]
+        return row
+
+    @wp.func
+    def write_row(contacts: Contacts, env: int, i: int, body: wp.vec2i, point: vec3, phi: real, row: Row):
+        contacts.body[env, i] = body
+        contacts.point[env, i] = point
+        contacts.gap[env, i] = phi
+        contacts.closed[env, i] = int(row.closed)
+        contacts.frame[env, i] = row.frame
+        contacts.inv_mass[env, i] = row.inv_mass
+        contacts.relaxation[env, i] = row.relaxation
+        contacts.shift[env, i] = row.shift
+        contacts.free[env, i] = row.free
+        contacts.mu[env, i] = row.mu
+        contacts.bound[env, i] = row.bound
+        if row.directions == DISC:
+            contacts.slip[env, i] = vec3(real(1.0), real(0.0), row.lateral)
+        contacts.directions[env, i] = row.directions
+        contacts.damping[env, i] = row.damping
+        contacts.impulse[env, i] = vec3()
+        contacts.state[env, i] = row.state
+
     return SimpleNamespace(
-        History=History,
-        point_velocity=body.point_velocity,
-        direction_mobility=body.direction_mobility,
-        contact_parameters=contact_parameters,
-        make_row=make_row,
+        contact_parameters=contact_parameters, velocities=velocities, mobility=mobility, read_row=read_row, write_row=write_row
     )
 
 
@@ -224,9 +317,8 @@ def make(real) -> SimpleNamespace:
     vec3, vec5 = t.vec3, t.vec5
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     f = row_functions(real)
-    History, make_row, contact_parameters = f.History, f.make_row, f.contact_parameters
-    point_velocity, direction_mobility = f.point_velocity, f.direction_mobility
-    shape_pose = pair_functions(real).shape_pose
+    contact_parameters, velocities, mobility = f.contact_parameters, f.velocities, f.mobility
+    read_row, write_row = f.read_row, f.write_row
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def combine_pairs(topology: Topology, parameters: Parameters):
@@ -269,23 +361,7 @@ def make(real) -> SimpleNamespace:
             for slot in range(slots.gap.shape[1]):
                 phi = slots.gap[env, slot]
                 if phi < real(NO_POINT):
-                    pair = topology.slot_pair[slot]
-                    body = topology.pair_body[pair]
-                    u = vec3()
-                    u_free = vec3()
-                    for side in range(2):
-                        sign = real(2 * side - 1)
-                        shape = topology.pairs[pair, side]
-                        b = body[side]
-                        belt = topology.surface_velocity[shape]
-                        if wp.dot(belt, belt) > real(0.0):
-                            belt = sign * wp.transform_vector(shape_pose(topology, bodies, env, shape), belt)
-                            u += belt
-                            u_free += belt
-                        if b >= 0:
-                            arm = slots.point[env, slot] - bodies.com[env, b]
-                            u += sign * point_velocity(bodies.velocity[env, b], arm)
-                            u_free += sign * point_velocity(bodies.free_velocity[env, b], arm)
+                    u, u_free = velocities(topology, bodies, env, topology.slot_pair[slot], slots.point[env, slot])
                     # Twice the speed counts, not its approaching part: an impact elsewhere on the body turns one into the
                     # other (1.1 mm of overlap at 1 ms with the approaching part alone, 3 um with this).
                     if phi < real(2.0) * h * wp.length(u_free) + fall:
@@ -317,53 +393,14 @@ def make(real) -> SimpleNamespace:
         for env in range(start, contacts.count.shape[0], stride):
             for i in range(lane, contacts.count[env], lanes):
                 slot = contacts.slot[env, i]
-                pair = topology.slot_pair[slot]
-                point = slots.point[env, slot]
-                phi = slots.gap[env, slot]
-                g = wp.length(parameters.gravity[env % parameters.gravity.shape[0]])
-                mu = parameters.pair_friction[env % parameters.pair_friction.shape[0], pair]
-                c = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair]
-                body = topology.pair_body[pair]
-                n = slots.normal[env, slot]
-                w_nn = real(0.0)
-                for side in range(2):
-                    b = body[side]
-                    if b >= 0:
-                        w_nn += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], point - bodies.com[env, b], n)
-                history = History()
-                history.touched = slots.last_feature[env, slot] == slots.feature[env, slot]
-                history.impulse = slots.last_impulse[env, slot]
-                history.bristle = slots.last_bristle[env, slot]
                 u = contacts.velocity[env, i]
                 u_free = contacts.free[env, i]
-                bend = slots.bend[env, slot]
-                row = make_row(w_nn, n, phi, bend, u, u_free, c, mu, history, g, h, sliding, directions, frozen)
-
-                t1 = row.frame[1]
-                t2 = row.frame[2]
-                w = vec3(w_nn, real(0.0), real(0.0))
-                for side in range(2):
-                    b = body[side]
-                    if b >= 0:
-                        arm = point - bodies.com[env, b]
-                        w[1] += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, t1)
-                        w[2] += direction_mobility(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], arm, t2)
-                contacts.body[env, i] = body
-                contacts.point[env, i] = point
-                contacts.gap[env, i] = phi
-                contacts.closed[env, i] = int(row.closed)
-                contacts.frame[env, i] = row.frame
-                contacts.inv_mass[env, i] = w
-                contacts.relaxation[env, i] = row.relaxation
-                contacts.shift[env, i] = row.shift
-                contacts.free[env, i] = row.frame * u_free + row.shift
-                contacts.mu[env, i] = row.mu
-                contacts.bound[env, i] = row.bound
-                if row.directions == DISC:
-                    contacts.slip[env, i] = vec3(real(1.0), real(0.0), row.lateral)
-                contacts.directions[env, i] = row.directions
-                contacts.damping[env, i] = c[3]
-                contacts.impulse[env, i] = vec3()
-                contacts.state[env, i] = row.state
+                body = topology.pair_body[topology.slot_pair[slot]]
+                point = slots.point[env, slot]
+                w_nn = mobility(bodies, env, body, point, slots.normal[env, slot])
+                row = read_row(topology, parameters, slots, env, slot, w_nn, u, u_free, h, sliding, directions, frozen)
+                w_1 = mobility(bodies, env, body, point, row.frame[1])
+                row.inv_mass = vec3(w_nn, w_1, mobility(bodies, env, body, point, row.frame[2]))
+                write_row(contacts, env, i, body, point, slots.gap[env, slot], row)
 
     return SimpleNamespace(combine_pairs=combine_pairs, select_contacts=select_contacts, contact_rows=contact_rows)

@@ -140,7 +140,9 @@ def functions(real) -> SimpleNamespace:
 
         Normal min(u_n, p_n w_n), tangential (p_t - P(p_t - rho_t u_t)) w_t, both relaxed where u is.
         """
-        target = project_friction(vec2(p[1] - u[1] / w[1], p[2] - u[2] / w[2]), mu * wp.max(p[0], real(0.0)) + bound, k)
-        return vec3(wp.min(u[0], p[0] * w[0]), (p[1] - target[0]) * w[1], (p[2] - target[1]) * w[2])
+        y = vec2(p[1] * w[1], p[2] * w[2])
+        limit = mu * wp.max(p[0], real(0.0)) + bound
+        target = project_friction(y - vec2(u[1], u[2]), vec2(limit[0] * w[1], limit[1] * w[2]), k)
+        return vec3(wp.min(u[0], p[0] * w[0]), y[0] - target[0], y[1] - target[1])
 
     return SimpleNamespace(project_friction=project_friction, admissible=admissible, slope=slope, weigh=weigh, law_error=law_error)

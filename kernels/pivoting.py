@@ -33,10 +33,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import sparse
-from .types import BLOCK_OPTIONS, OPTIONS, scalar_types, sync
+from .types import BLOCK_OPTIONS, CLOSED, scalar_types, sync
 
-# State of a contact while it is solved: bit 0 closed, bits 1-2 axis t1, bits 3-4 axis t2.
-CLOSED = wp.constant(1)
 AXIS_STICKS = 0
 AXIS_SLIDES_UP = 1  # along +t: the impulse is -mu p_n
 AXIS_SLIDES_DOWN = 2
@@ -59,40 +57,36 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
         return (state >> (1 + 2 * axis)) & 3
 
     @wp.func
-    def axis_impulse(relaxed: real, eps: real, limit: real, state: int) -> real:
-        """Impulse of a friction axis in the given state; relaxed = f_j + J_j x, limit = mu p_n + bound."""
-        p = -limit
-        if state == AXIS_STICKS:
-            p = -relaxed / eps
-        elif state == AXIS_SLIDES_DOWN:
-            p = limit
-        return p
+    def axis(relaxed: real, eps: real, limit: real, next_limit: real, state: int, tolerance: real):
+        """Impulse of a friction axis in its state, and the state that its signs ask for at the limit to come.
 
-    @wp.func
-    def next_axis_state(relaxed: real, eps: real, limit: real, state: int, tolerance: real) -> int:
-        """State that the sign conditions ask for; `tolerance` [m/s] keeps round-off from flipping it."""
+        relaxed = f_j + J_j x, limit = mu p_n + bound; `tolerance` [m/s] keeps round-off from flipping it.
+        """
+        p = -limit
         result = state
         if state == AXIS_STICKS:
-            p = -relaxed / eps
-            slack = tolerance / eps * real(1.0e-6)
-            if p > limit + slack:
+            stiffness = real(1.0) / eps
+            p = -relaxed * stiffness
+            slack = tolerance * stiffness * real(1.0e-6)
+            if p > next_limit + slack:
                 result = AXIS_SLIDES_DOWN
-            elif p < -limit - slack:
+            elif p < -next_limit - slack:
                 result = AXIS_SLIDES_UP
         elif state == AXIS_SLIDES_UP:
-            if relaxed - eps * limit < -tolerance:
+            if relaxed - eps * next_limit < -tolerance:
                 result = AXIS_STICKS
         else:
-            if relaxed + eps * limit > tolerance:
+            p = limit
+            if relaxed + eps * next_limit > tolerance:
                 result = AXIS_STICKS
-        return result
+        return p, result
 
     @wp.func
-    def next_closed(relaxed: real, eps: real, w_nn: real, state: int, tolerance: real) -> int:
-        """CLOSED or 0, as the signs of gap velocity and normal impulse ask for."""
+    def next_closed(relaxed: real, pressed: real, mass: real, state: int, tolerance: real) -> int:
+        """CLOSED or 0, as the signs of gap velocity and normal impulse ask for; pressed = -relaxed / eps, mass = w_nn + eps."""
         closed = state & CLOSED
         if closed != 0:
-            if -relaxed / eps * (w_nn + eps) < -tolerance:
+            if pressed * mass < -tolerance:
                 closed = 0
         elif relaxed < -tolerance:
             closed = CLOSED
@@ -107,37 +101,9 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
         return result
 
     @wp.func
-    def next_state(relaxed: vec3, eps: vec3, w_nn: real, mu: vec2, bound: vec2, k: int, state: int, tolerance: real) -> int:
-        """State that the sign conditions of a contact ask for; relaxed = f + J x, w_nn of J M^-1 J^T."""
-        closed = next_closed(relaxed[0], eps[0], w_nn, state, tolerance)
+    def next_cone(relaxed: vec3, eps: vec3, w: vec3, mu: real, p_n: real, closed: int, state: int, slip: vec3):
+        """State on Coulomb's cone, slip (s_1, s_2, eps_l), and whether either changed; w of J M^-1 J^T, closed: what comes."""
         result = closed | (state & 30)
-        if has_friction(state & closed, bound, k):
-            limit = bound
-            if closed != 0:
-                limit += mu * wp.max(-relaxed[0] / eps[0], real(0.0))
-            first = next_axis_state(relaxed[1], eps[1], limit[0], axis_state(state, 0), tolerance)
-            second = next_axis_state(relaxed[2], eps[2], limit[1], axis_state(state, 1), tolerance)
-            result = closed | (first << 1) | (second << 3)
-        return result
-
-    @wp.func
-    def state_impulse(relaxed: vec3, eps: vec3, mu: vec2, bound: vec2, k: int, state: int) -> vec3:
-        """Impulse of a contact in its state; relaxed = f + J x."""
-        p = vec3()
-        if (state & CLOSED) != 0:
-            p[0] = wp.max(-relaxed[0] / eps[0], real(0.0))
-        if has_friction(state, bound, k):
-            limit = mu * p[0] + bound
-            p[1] = axis_impulse(relaxed[1], eps[1], limit[0], axis_state(state, 0))
-            p[2] = axis_impulse(relaxed[2], eps[2], limit[1], axis_state(state, 1))
-        return p
-
-    @wp.func
-    def next_cone(relaxed: vec3, eps: vec3, w: vec3, mu: real, state: int, slip: vec3, tolerance: real):
-        """The same for Coulomb's cone: state, slip (s_1, s_2, eps_l), and whether either changed; w of J M^-1 J^T."""
-        closed = next_closed(relaxed[0], eps[0], w[0], state, tolerance)
-        result = closed | (state & 30)
-        p_n = wp.max(-relaxed[0] / eps[0], real(0.0))
         limit = mu * p_n
         size = wp.sqrt(relaxed[1] * relaxed[1] + relaxed[2] * relaxed[2])
         turned = bool(False)
@@ -161,19 +127,15 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
         return result, after, turned or result != state
 
     @wp.func
-    def cone_impulse(relaxed: vec3, eps: vec3, mu: real, state: int) -> vec3:
-        """Impulse of a contact on the cone, as the linear system of its state saw it."""
+    def cone_friction(relaxed: vec3, eps: vec3, limit: real, state: int) -> vec3:
+        """Friction impulse of a closed contact on the cone, as the linear system of its state saw it."""
         p = vec3()
-        if (state & CLOSED) != 0:
-            p[0] = wp.max(-relaxed[0] / eps[0], real(0.0))
-            if axis_state(state, 0) == AXIS_STICKS:
-                p[1] = -relaxed[1] / eps[1]
-                p[2] = -relaxed[2] / eps[1]
-            else:
-                size = wp.sqrt(relaxed[1] * relaxed[1] + relaxed[2] * relaxed[2])
-                if size > real(0.0):
-                    p[1] = -mu * p[0] * relaxed[1] / size
-                    p[2] = -mu * p[0] * relaxed[2] / size
+        if axis_state(state, 0) == AXIS_STICKS:
+            p = vec3(real(0.0), -relaxed[1], -relaxed[2]) * (real(1.0) / eps[1])
+        else:
+            size = wp.sqrt(relaxed[1] * relaxed[1] + relaxed[2] * relaxed[2])
+            if size > real(0.0):
+                p = vec3(real(0.0), -relaxed[1], -relaxed[2]) * (limit / size)
         return p
 
     @wp.func
@@ -197,7 +159,7 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
                 e2 = slip[2]
         if has_friction(state, bound, k):
             if axis_state(state, 0) == AXIS_STICKS:
-                scaled = t1 / eps[1]
+                scaled = t1 * (real(1.0) / eps[1])
                 matrix += wp.outer(scaled, t1)
                 shift += scaled * f1
             else:
@@ -208,7 +170,7 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
                 if wp.static(frozen):
                     shift -= (sign * bound[0]) * t1
             if axis_state(state, 1) == AXIS_STICKS:
-                scaled = t2 / e2
+                scaled = t2 * (real(1.0) / e2)
                 matrix += wp.outer(scaled, t2)
                 shift += scaled * f2
             else:
@@ -219,7 +181,7 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
                 if wp.static(frozen):
                     shift -= (sign * bound[1]) * t2
         if (state & CLOSED) != 0:
-            column = column / eps[0]
+            column = column * (real(1.0) / eps[0])
             matrix += wp.outer(column, n)
             shift += column * free[0]
         return matrix, shift
@@ -231,164 +193,33 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
         relaxed = f + J x; w: diagonal of J M^-1 J^T.
         """
         p = vec3()
-        after = int(0)
         turned = slip
-        again = bool(False)
+        pressed = -relaxed[0] / eps[0]
+        closed = next_closed(relaxed[0], pressed, w[0] + eps[0], state, tolerance)
+        after = closed | (state & 30)
+        again = after != state
+        pressed = wp.max(pressed, real(0.0))
+        if (state & CLOSED) != 0:
+            p[0] = pressed
         if wp.static(cone):
             if k != 0:
-                p = cone_impulse(relaxed, eps, mu[0], state)
-                after, turned, again = next_cone(relaxed, eps, w, mu[0], state, slip, tolerance)
-            else:
                 if (state & CLOSED) != 0:
-                    p[0] = wp.max(-relaxed[0] / eps[0], real(0.0))
-                after = next_closed(relaxed[0], eps[0], w[0], state, tolerance) | (state & 30)
+                    p += cone_friction(relaxed, eps, mu[0] * pressed, state)
+                after, turned, again = next_cone(relaxed, eps, w, mu[0], pressed, closed, state, slip)
+        elif has_friction(state, bound, k):
+            limit = mu * p[0] + bound
+            next_limit = bound
+            if closed != 0:
+                next_limit += mu * pressed
+            p_1, first = axis(relaxed[1], eps[1], limit[0], next_limit[0], axis_state(state, 0), tolerance)
+            p_2, second = axis(relaxed[2], eps[2], limit[1], next_limit[1], axis_state(state, 1), tolerance)
+            p = vec3(p[0], p_1, p_2)
+            if has_friction(state & closed, bound, k):
+                after = closed | (first << 1) | (second << 3)
                 again = after != state
-        else:
-            p = state_impulse(relaxed, eps, mu, bound, k, state)
-            after = next_state(relaxed, eps, w[0], mu, bound, k, state, tolerance)
-            again = after != state
         return p, after, turned, again
 
     return SimpleNamespace(has_friction=has_friction, operator=operator, update=update)
-
-
-@functools.cache
-def make_single(real, cone: bool, frozen: bool):
-    """Kernel ``pivot_single`` for scenes with one movable body: a thread an environment, 6 x 6 in registers; dim (E)."""
-    t = scalar_types(real)
-    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
-    vec6 = wp.types.vector(length=6, dtype=real)
-    mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
-    Bodies, Contacts = t.Bodies, t.Contacts
-    f = functions(real, cone, frozen)
-    has_friction, operator, update = f.has_friction, f.operator, f.update
-
-    @wp.func
-    def solve(vv: mat33, vw: mat33, wv: mat33, ww: mat33, bv: vec3, bw: vec3) -> vec6:
-        """Gaussian elimination; the certificate judges the answer, so no pivot search."""
-        a = mat66()
-        b = vec6()
-        for i in range(3):
-            b[i] = bv[i]
-            b[3 + i] = bw[i]
-            for j in range(3):
-                a[i, j] = vv[i, j]
-                a[i, 3 + j] = vw[i, j]
-                a[3 + i, j] = wv[i, j]
-                a[3 + i, 3 + j] = ww[i, j]
-        p = vec6()
-        for k in range(6):
-            p[k] = real(1.0) / a[k, k]
-            for i in range(k + 1, 6):
-                g = a[i, k] * p[k]
-                b[i] = b[i] - g * b[k]
-                for j in range(k + 1, 6):
-                    a[i, j] = a[i, j] - g * a[k, j]
-        for kk in range(6):
-            k = 5 - kk
-            x = b[k]
-            for j in range(k + 1, 6):
-                x -= a[k, j] * b[j]
-            b[k] = x * p[k]
-        return b
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def pivot_single(
-        bodies: Bodies,
-        body: int,
-        contacts: Contacts,
-        todo: wp.array(dtype=int),
-        number: wp.array(dtype=int),
-        limit: int,
-        tolerance: real,
-        iterations: wp.array(dtype=int),
-        stride: int,
-    ):
-        start, _ = wp.tid()
-        for index in range(start, number[0], stride):
-            env = todo[index]
-            r = contacts.count[env]
-            if r == 0:
-                continue
-            com = bodies.com[env, body]
-            inertia = wp.inverse(bodies.inv_inertia[env, body])
-            mass = wp.diag(vec3(real(1.0) / bodies.inv_mass[env, body]))
-            flips = int(1)
-            solves = int(0)
-            while flips > 0 and solves < limit:
-                vv = mass
-                vw = mat33()
-                wv = mat33()
-                ww = inertia
-                bv = vec3()
-                bw = vec3()
-                for i in range(r):
-                    state = contacts.state[env, i]
-                    k = contacts.directions[env, i]
-                    bound = vec2()
-                    if wp.static(frozen):
-                        bound = contacts.bound[env, i]
-                    if (state & CLOSED) != 0 or has_friction(state, bound, k):
-                        slip = vec3()
-                        if wp.static(cone):
-                            slip = contacts.slip[env, i]
-                        matrix, shift = operator(
-                            contacts.frame[env, i],
-                            contacts.relaxation[env, i],
-                            contacts.free[env, i],
-                            contacts.mu[env, i],
-                            bound,
-                            k,
-                            state,
-                            slip,
-                        )
-                        if contacts.body[env, i][0] == body:
-                            shift = -shift
-                        arm = contacts.point[env, i] - com
-                        turn = wp.skew(arm)
-                        right = matrix * turn
-                        vv += matrix
-                        vw -= right
-                        wv += turn * matrix
-                        ww -= turn * right
-                        bv -= shift
-                        bw -= wp.cross(arm, shift)
-                x = solve(vv, vw, wv, ww, bv, bw)
-                solves += 1
-                flips = int(0)
-                dv = vec3(x[0], x[1], x[2])
-                dw = vec3(x[3], x[4], x[5])
-                for i in range(r):
-                    du = dv + wp.cross(dw, contacts.point[env, i] - com)
-                    if contacts.body[env, i][0] == body:
-                        du = -du
-                    relaxed = contacts.free[env, i] + contacts.frame[env, i] * du
-                    bound = vec2()
-                    if wp.static(frozen):
-                        bound = contacts.bound[env, i]
-                    slip = vec3()
-                    if wp.static(cone):
-                        slip = contacts.slip[env, i]
-                    p, after, turned, again = update(
-                        relaxed,
-                        contacts.relaxation[env, i],
-                        contacts.inv_mass[env, i],
-                        contacts.mu[env, i],
-                        bound,
-                        contacts.directions[env, i],
-                        contacts.state[env, i],
-                        slip,
-                        tolerance,
-                    )
-                    contacts.impulse[env, i] = p
-                    if again:
-                        flips += 1
-                        contacts.state[env, i] = after
-                        if wp.static(cone):
-                            contacts.slip[env, i] = turned
-            iterations[env] = iterations[env] + solves
-
-    return pivot_single
 
 
 @functools.cache

@@ -22,6 +22,9 @@ OPEN = wp.constant(0)
 STICK = wp.constant(1)
 SLIDE = wp.constant(2)
 
+# State of a contact while it is solved: bit 0 closed, bits 1-2 axis t1, bits 3-4 axis t2.
+CLOSED = wp.constant(1)
+
 # Status bits (warp_lcp.Status).
 ITERATION_LIMIT = wp.constant(1)
 RAY = wp.constant(2)

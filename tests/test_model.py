@@ -88,8 +88,8 @@ def test_only_the_kernels_that_a_scene_needs():
 
     names = kernel_names(paper_box())
     assert "plane_box" in names
-    assert "pivot_single" in names
-    assert not {"box_box", "plane_sphere", "sphere_box", "sphere_sphere", "pivot"} & set(names)
+    assert "solve_single" in names
+    assert not {"box_box", "plane_sphere", "sphere_box", "sphere_sphere", "pivot", "contact_rows"} & set(names)
     assert not any("capsule" in name for name in names)
 
 

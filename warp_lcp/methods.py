@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Solution methods of the contact problem. A method sees one problem, the rows of every environment, and leaves impulses.
 
-A new method is a class with ``kernel`` (chosen for a model), ``prepare`` (allocate, once) and ``launch`` (record, no host
-read-back, for the environments todo[:number] that are listed on the device), entered in METHODS.
+A new method is a :class:`Method`, entered in METHODS.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from .errors import WarpLcpError
-from .kernels import contact_problem, lcp, pgs, pivoting, problem, proximal, sparse
+from .kernels import contact_problem, lcp, pgs, pivoting, problem, proximal, single, sparse
 from .kernels.types import LANES, scalar_types
 from .laws import Law
 from .model import JointType, Model
@@ -86,7 +85,30 @@ def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
     return 1 if device.is_cpu else max(1, min(num_envs, GPU_WORKSPACES, GPU_WORKSPACE_BYTES // (8 * max(scalars, 1))))
 
 
-class AssembledLCP:
+class Method:
+    """``kernel`` (chosen for a model), ``prepare`` (allocate, once) and ``launch`` (record, no host read-back).
+
+    Attributes:
+        makes_rows: the kernel makes the contact rows as well, if it is the first of a step.
+        judges: the kernel certifies its answers, and lists those that it cannot in sim.doubtful[:sim.num_doubtful].
+    """
+
+    kernel: Any
+    makes_rows = False
+    judges = False
+
+    def prepare(self, sim: Simulator) -> None:
+        """Allocate what the kernel needs."""
+
+    def take_rows(self) -> None:
+        """From now on rows are made, and changed, before they are solved (kernels/restitution.py)."""
+
+    def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
+        """The environments todo[:number] that are listed on the device."""
+        raise NotImplementedError
+
+
+class AssembledLCP(Method):
     """A method for dense LCPs ('lemke', 'murty' or 'judice_pires') on the assembled LCP of eq. 39, no fallback."""
 
     def __init__(self, solver: str, model: Model, real: Any, law: Law):
@@ -112,7 +134,7 @@ class AssembledLCP:
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
-class ProximalNewton:
+class ProximalNewton(Method):
     """Proximal semismooth Newton on the contacts, any law."""
 
     SWEEPS = 20
@@ -135,7 +157,7 @@ class ProximalNewton:
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
-class VelocityPivoting:
+class VelocityPivoting(Method):
     """Principal pivoting on contact states in the velocities, for laws with two friction axes or a disc."""
 
     LIMIT = 12
@@ -144,10 +166,21 @@ class VelocityPivoting:
 
     def __init__(self, model: Model, real: Any, law: Law):
         self.movable = np.flatnonzero(model.joint_type == JointType.FREE)
-        self.single = len(self.movable) == 1
-        kind = (real, law.is_cone, law.has_frozen_limits)
-        self.parts = None if self.single else pivoting.make(*kind)
-        self.kernel = pivoting.make_single(*kind) if self.parts is None else self.parts.pivot
+        self.kind = (real, law.is_cone, law.has_frozen_limits)
+        self.parts = None
+        if len(self.movable) == 1:
+            self.judges = self.makes_rows = True
+            self.kernel = single.make(*self.kind, self.makes_rows)
+        else:
+            self.parts = pivoting.make(*self.kind)
+            self.kernel = self.parts.pivot
+        if model.restitution.any():
+            self.take_rows()
+
+    def take_rows(self) -> None:
+        if self.makes_rows:
+            self.makes_rows = False
+            self.kernel = single.make(*self.kind, self.makes_rows)
 
     def prepare(self, sim: Simulator) -> None:
         if self.parts is None:
@@ -174,24 +207,25 @@ class VelocityPivoting:
         ws.flips = wp.zeros(self.slots, dtype=int, device=sim.device)
 
     def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
-        tail = [self.LIMIT, sim.sign_tolerance, sim.iterations]
-        if self.single:
-            sim.launch(self.kernel, [sim.bodies, int(self.movable[0]), sim.rows, todo, number, *tail])
+        if self.parts is None:
+            scene = [sim.topology, sim.parameters, sim.bodies, sim.slots, sim.rows, int(self.movable[0])]
+            lists = [todo, number, sim.doubtful, sim.num_doubtful, sim.unsolved]
+            answer = [sim.residual, sim.residual_energy, sim.iterations]
+            limits = [self.LIMIT, sim.sign_tolerance, sim.tolerance]
+            sim.launch(self.kernel, [*scene, sim.dt, *sim.law.row_arguments, *limits, sim.next_velocity, *lists, *answer])
         else:
+            tail = [self.LIMIT, sim.sign_tolerance, sim.iterations]
             inputs = [sim.bodies, sim.rows, todo, number, self.graph, self.workspace, *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
-class BlockPGS:
+class BlockPGS(Method):
     """Block projected Gauss-Seidel: a fixed number of cold sweeps, fewer where it converges."""
 
     SWEEPS = 50
 
     def __init__(self, model: Model, real: Any, law: Law):
         self.kernel = pgs.make(real)
-
-    def prepare(self, sim: Simulator) -> None:
-        """Nothing to allocate: the velocities are the simulator's."""
 
     def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
         # Sweeps end where no impulse changes a velocity by more than a hundredth of what certifies an answer.

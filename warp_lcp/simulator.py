@@ -285,8 +285,10 @@ class Simulator:
                 for name in names:
                     setattr(bounces, name, wp.zeros(self.num_envs, dtype=dtype, device=self.device))
             bounces.again = wp.zeros(1, dtype=int, device=self.device)
-            if k.bounce not in self.kernels:
-                self._load([k.bounce, k.judge, k.settle])
+            self._methods[0].take_rows()
+            self._kernels.contact_rows = contacts.make(self.real).contact_rows
+            needed = [k.bounce, k.judge, k.settle, self._kernels.contact_rows, self._methods[0].kernel]
+            self._load([kernel for kernel in needed if kernel not in self.kernels])
             self._graphs.clear()
 
     def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
@@ -359,8 +361,9 @@ class Simulator:
             self.launch(kernel, [self.topology, self.bodies, first, h, self.slots], number)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
-        lanes = 1 if self.device.is_cpu else self.model.max_contacts
-        self.launch(k.contact_rows, [*scene, self.bodies, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
+        if not self._methods[0].makes_rows:
+            lanes = 1 if self.device.is_cpu else self.model.max_contacts
+            self.launch(k.contact_rows, [*scene, self.bodies, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
         if self.bounces is not None:
             self.launch(
                 k.bounce, [*scene, h, self.tolerance, int(self.integrator == "midpoint"), self.rows, self.bounces], self.model.max_contacts
@@ -378,12 +381,19 @@ class Simulator:
     def _solve_kernels(self, todo: wp.array, number: wp.array, status: wp.array) -> None:
         """The environments todo[:number] by the first method, those left by the next, and so on; each answer certified."""
         self.queued.zero_()
+        self.num_doubtful.zero_()
         self._solve_with(0, todo, number, status)
 
     def _solve_with(self, i: int, todo: wp.array, number: wp.array, status: wp.array) -> None:
+        self._methods[i].launch(self, todo, number)
+        if self._methods[i].judges:
+            self._where(self.num_doubtful, lambda: self._certify(i, self.doubtful, self.num_doubtful, status))
+        else:
+            self._certify(i, todo, number, status)
+
+    def _certify(self, i: int, todo: wp.array, number: wp.array, status: wp.array) -> None:
         last = i + 1 == len(self._methods)
         left, number_left = (todo, number) if last else (self.queues[i], self.queued[i : i + 1])
-        self._methods[i].launch(self, todo, number)
         lists = [todo, number, left, number_left]
         answer = [*lists, self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, status]
         problem = [self.bodies, self.dt, self.tolerance, i, int(last), self.next_velocity, self.rows, self.slots]
@@ -505,14 +515,16 @@ class Simulator:
         self.residual, self.residual_energy, self.best_residual = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(3))
 
     def _load_kernels(self) -> None:
-        self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator)
         self._methods = [method(self.model, self.real, self.law) for method in chosen(self.method, self.precision, self.law)]
+        self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator, self._methods[0].makes_rows)
         for method in self._methods:
             method.prepare(self)
-        # Environments that each method but the last leaves to the next.
-        left = len(self._methods) - 1
+        # Environments that each method but the last leaves to the next, and those whose answer the first could not certify.
+        left, doubtful = len(self._methods) - 1, self.num_envs if self._methods[0].judges else 0
         self.queues: wp.array = wp.empty((left, self.num_envs), dtype=int, device=self.device)
         self.queued: wp.array = wp.zeros(left, dtype=int, device=self.device)
+        self.doubtful: wp.array = wp.empty(doubtful, dtype=int, device=self.device)
+        self.num_doubtful: wp.array = wp.zeros(1, dtype=int, device=self.device)
         pair_kernels = [kernel for kernel, *_ in self._pair_kernels]
         self.kernels: list[Any] = []
         self._load([*vars(self._kernels).values(), *pair_kernels, *(m.kernel for m in self._methods)])
@@ -527,7 +539,7 @@ class Simulator:
             wp.force_load(self.device, modules=modules, block_dim=block_dim)
 
 
-def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
+def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
     """Kernels of the stages by name, and (kernel, first pair, number of pairs) for each kind of pair in the model."""
     body, rows, motion = bodies.make(real), contacts.make(real), integrate.make(real)
     stages = SimpleNamespace(
@@ -535,10 +547,11 @@ def stage_kernels(model: Model, real: Any, integrator: str) -> tuple[SimpleNames
         free_motion=body.free_motion,
         combine_pairs=rows.combine_pairs,
         select_contacts=rows.select_contacts,
-        contact_rows=rows.contact_rows,
         certify=certify.make(real),
         reset=reset.make(real),
     )
+    if not without_rows:
+        stages.contact_rows = rows.contact_rows
     if model.restitution.any():
         rebound = restitution.make(real)
         stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
@@ -560,8 +573,9 @@ def kernel_names(
 ) -> list[str]:
     """Names of the kernels that a Simulator of the model compiles."""
     real, law = PRECISIONS[precision][0], law or Law()
-    stages, pairs = stage_kernels(model, real, integrator)
-    solvers = [kind(model, real, law).kernel for kind in chosen(method, precision, law)]
+    methods = [kind(model, real, law) for kind in chosen(method, precision, law)]
+    stages, pairs = stage_kernels(model, real, integrator, methods[0].makes_rows)
+    solvers = [kind.kernel for kind in methods]
     return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *(k for k, *_ in pairs), *solvers)]
 
 
