@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches: environments are independent to the last bit, failures stay where they are, parameters differ per environment."""
 
+import re
+
 import numpy as np
 import pytest
 import warp as wp
@@ -270,6 +272,27 @@ def test_scenes_without_contacts_or_movable_bodies():
 def test_arguments_are_checked(arguments, message):
     with pytest.raises(wl.WarpLcpError, match=message):
         simulator(paper_box(), **arguments)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, None, "2", "two", 2.5, True, -1, [2, 2], 2j], ids=str)
+def test_counts_are_whole_numbers(value):
+    """Anything else is one clear line, whoever asks for the count."""
+    sim = simulator(paper_box())
+    asked = {
+        "num_envs": lambda x: simulator(paper_box(), num_envs=x),
+        "directions": lambda x: simulator(paper_box(), directions=x),
+        "step: count": sim.step,
+        "rollout: steps": sim.rollout,
+        "rollout: every": lambda x: sim.rollout(3, every=x),
+        "solve_contact: directions": lambda x: wl.solve_contact(np.eye(3), np.ones(3), 0.5, directions=x, device="cpu"),
+    }
+    for what, ask in asked.items():
+        with pytest.raises(wl.WarpLcpError, match=rf"^{what} is {re.escape(repr(value))}; give a whole number of at least [012]$"):
+            ask(value)
+    assert sim.time == 0.0
+    for number in (2, 2.0, np.int32(2), np.float64(2.0), np.array(2)):
+        sim.step(number)
+    assert sim.time == pytest.approx(0.01)
 
 
 def test_environments_that_need_another_method_leave_the_others_alone():

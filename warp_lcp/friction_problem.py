@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from .arrays import check_finite, device_of, is_single, on_device, read
-from .errors import WarpLcpError
+from .errors import WarpLcpError, whole_number
 from .kernels import contact_problem
 from .kernels.types import LANES
 from .methods import contact_workspace, workspaces
@@ -104,8 +104,7 @@ def prepare(
         raise WarpLcpError(
             f"solve_contact: method is {method!r}; choose one of {', '.join(METHODS)} (methods for LCPs are behind solve_lcp)"
         )
-    if int(directions) != directions or directions < 2:
-        raise WarpLcpError(f"solve_contact: directions is {directions}; give a whole number of at least 2")
+    directions = whole_number("solve_contact: directions", directions, 2)
     me = "solve_contact"
     W, q, mu = read(me, "W", W), read(me, "q", q), read(me, "mu", mu)
     if W.ndim not in (2, 3) or W.ndim != q.ndim + 1 or W.shape != (*q.shape, q.shape[-1]) or q.shape[-1] % 3:
@@ -134,7 +133,7 @@ def prepare(
     if batch == 0 or contacts == 0:
         return solution, None
     sweeps, limit = METHODS[method]
-    inputs = [W, q, mu, int(code), limit, sweeps, tolerance]
+    inputs = [W, q, mu, code, limit, sweeps, tolerance]
     if device.is_cpu and contacts <= SMALL:
         inputs += _kept_workspace(real, contacts, str(device), threading.get_ident())
     else:
