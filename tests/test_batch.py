@@ -105,6 +105,27 @@ def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
         assert (bits(sim) == same).all()
 
 
+@pytest.mark.parametrize("method", ["velocity_pivoting", "proximal_newton", "lemke"])
+def test_workspaces_take_what_they_are_counted_at(monkeypatch, method):
+    """Scalars a workspace, by which a GPU's memory is shared out, against the bytes that three of them take: 40 boxes."""
+    counted = []
+
+    def workspaces(envs, scalars, device):
+        counted.append(scalars)
+        return 3
+
+    monkeypatch.setattr("warp_lcp.methods.workspaces", workspaces)
+    builder = wl.ModelBuilder()
+    builder.add_plane()
+    for k in range(40):
+        builder.add_box(builder.add_body(pose=(0.3 * k, 0, 0.1, 0, 0, 0, 1)), (0.1, 0.1, 0.1))
+    (made,) = simulator(builder, method=method)._methods
+    parts = [part for value in vars(made).values() for part in (value if isinstance(value, tuple) else (value,))]
+    arrays = [getattr(part, name) for part in parts if hasattr(part, "_cls") for name in part._cls.vars]
+    total = sum(a.capacity for a in arrays if a is not None and a.shape[0] == 3)
+    assert total / 3 == pytest.approx(8 * counted[0], rel=0.03)
+
+
 def test_a_nan_is_flagged_contained_and_healed_by_a_masked_reset():
     fresh = simulator(paper_box(), 8)
     fresh.step(50)
