@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .arrays import check_finite, device_of, is_single, on_device, read
+from .arrays import check_finite, check_strides, device_of, is_single, on_device, read
 from .errors import WarpLcpError, whole_number
 from .kernels import contact_problem
 from .kernels.types import LANES
@@ -111,6 +111,7 @@ def prepare(
         raise WarpLcpError(f"{me}: W has shape {tuple(W.shape)} and q {tuple(q.shape)}; give [B, 3r, 3r] and [B, 3r], or [3r, 3r] and [3r]")
     real = wp.float32 if is_single(W) and is_single(q) else wp.float64
     device = device_of(me, device, W=W, q=q)
+    check_strides(me, "W", W, real)
     for name, x in (("W", W), ("q", q), ("mu", mu)):
         check_finite(me, name, x)
     W, q = on_device(W, real, device), on_device(q, real, device)
