@@ -10,6 +10,7 @@ from conftest import DEVICE, block_on_plane, paper_box, random_quaternions, simu
 from conftest import GRAVITY as G
 
 import warp_lcp as wl
+from warp_lcp import methods
 
 
 def bits(sim: wl.Simulator) -> np.ndarray:
@@ -103,6 +104,18 @@ def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
         assert sim.q.strides[0] < sim.q.strides[1]
         sim.step(200)
         assert (bits(sim) == same).all()
+
+
+@pytest.mark.parametrize("name", ["ProximalNewton", "BlockPGS"])
+def test_a_method_that_is_stopped_says_so(monkeypatch, name):
+    """Alone and without a single sweep or step: not certified, and the limit is named as what stopped it."""
+    method = getattr(methods, name)
+    monkeypatch.setattr(method, "SWEEPS", 0)
+    monkeypatch.setattr(method, "LIMIT", 0, raising=False)
+    sim = simulator(paper_box(), method={"ProximalNewton": "proximal_newton", "BlockPGS": "pgs"}[name])
+    sim.step()
+    assert sim.status.numpy()[0] == wl.Status.ITERATION_LIMIT | wl.Status.UNCERTIFIED
+    assert sim.residual.numpy()[0] == pytest.approx(G * 1e-3)  # no impulse at all
 
 
 @pytest.mark.parametrize("method", ["velocity_pivoting", "proximal_newton", "lemke"])
