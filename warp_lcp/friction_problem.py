@@ -74,7 +74,7 @@ def solve_contact(
         mu: [B, r], [r] or one number, friction coefficients.
         formulation: 'coulomb', 'phantom_inertia' or 'anitescu_potra'.
         method: 'auto' (the proximal Newton method), 'proximal_newton' or 'pgs' (block Gauss-Seidel).
-        directions: k of the polygons, at angles j pi / k from t1.
+        directions: k of the polygons, at angles j pi / k from t1; 'coulomb' has none.
         tolerance: largest residual of an answer that counts as solved, in parts of max |q|; None = 1e-10, in float32 1e-4.
         device: Warp device; None = that of W and q if they are on one, Warp's default otherwise.
 

@@ -18,8 +18,8 @@ class Law:
 
     Attributes:
         formulation: one of FORMULATIONS.
-        sliding: one of SLIDING, for 'phantom_inertia'; the others have their own way to slide.
-        directions: k of a sticking contact, at least 2; 'coulomb' has none.
+        sliding: one of SLIDING, for 'phantom_inertia'; the others have their own way to slide, whatever it says.
+        directions: k of a sticking contact, at least 2; 'coulomb' has none, whatever it says.
 
     Raises:
         WarpLcpError: where there is no such law.

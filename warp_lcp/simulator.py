@@ -90,8 +90,9 @@ class Simulator:
         method: how the contact problem is solved: 'velocity_pivoting', 'proximal_newton', 'pgs', 'lemke', 'murty', 'judice_pires', or
             'auto': velocity pivoting where the law has axes (not in float32), then the proximal Newton method, then pgs, each for
             the environments that are not solved by then.
-        sliding: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes throughout).
-        directions: k, friction directions of a sticking contact, at least 2.
+        sliding: how 'phantom_inertia' slides: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes
+            throughout). The other laws do not ask: 'hybrid' is regularized, 'anitescu_potra' and 'box' have facets, 'coulomb' the cone.
+        directions: k, friction directions of a sticking contact (with facets, of a sliding one too), at least 2; 'coulomb' has none.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
         precision: 'float64' or 'float32', of state and solution.
         integrator: 'euler', q+ = q + h Gamma v+ (eq. 23), or 'midpoint', q+ = q + h Gamma (v + v+) / 2 but for bodies that
