@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from . import friction, lcp, paper, paper_picture, peers, report, resources, robust, speed
+from . import friction, goals, lcp, paper, paper_picture, peers, report, resources, robust, speed, step_floor
 from .peers import compare
 
 
@@ -33,7 +33,9 @@ def arguments() -> argparse.Namespace:
     place.add_argument("--dir", type=Path, default=peers.FOLDER, help="folder of the peers' interpreters")
     commands = parser.add_subparsers(dest="what", required=True)
 
-    timing = commands.add_parser("speed", parents=[out, quick, place], help="env-steps/s of the paper's box, start-up, peers")
+    timing = commands.add_parser(
+        "speed", parents=[out, quick, place], help="env-steps/s of the paper's box, start-up, mass ratios, fallback, floors, peers"
+    )
     timing.add_argument("--device", default=None, help="Warp device (default: Warp's); peers are compared on the CPU")
     timing.add_argument(
         "--peers", type=peer_names, default="all", metavar="all|none|NAME,...", help="those that are installed (default: all)"
@@ -95,7 +97,9 @@ def main() -> None:
         rows = speed.measure(device, quick=asked.quick)
         start = speed.start_up()
         print(speed.markdown(rows, start))
-        data = {"start_up": start, "rows": rows}
+        stacks, failures, floors = goals.mass_ratio(asked.quick), goals.fallback(device, asked.quick), step_floor.measure(asked.quick)
+        print(f"\n{goals.markdown(stacks, failures)}\n\n{step_floor.markdown(floors)}")
+        data = {"start_up": start, "rows": rows, "mass_ratio": stacks, "fallback": failures, "step_floor": floors}
         report.write(asked.out, asked.what, device, data)  # kept if a peer fails
         data |= compared(asked.peers, asked.quick, asked.dir)
     elif asked.what == "peers":

@@ -282,7 +282,7 @@ def functions(real) -> SimpleNamespace:
 def make(real, method: str, generators: bool = False):
     """Kernel ``assembled_lcp`` for 'lemke', 'murty' or 'judice_pires', of eq. 39 or of Anitescu and Potra.
 
-    Launch tiled with dim (P): workspace P serves the environments P, P + num, ...
+    Launch tiled with dim (P): workspace p serves the environments todo[p], todo[p + P], ... of todo[:number].
     """
     t = scalar_types(real)
     Bodies, Contacts = t.Bodies, t.Contacts

@@ -34,7 +34,8 @@ def functions(real, size: int) -> SimpleNamespace:
     class Graph:
         """A symmetric pattern of at most n nodes and m blocks off the diagonal, and matrices that have it.
 
-        P workspaces. Rows of the matrix are in the caller's order, factors in the order of elimination.
+        P workspaces. Rows of the matrix are in the caller's order, factors in the order of elimination. diagonal and block are
+        the caller's alone: without arrays where it keeps no matrix besides the factors.
         """
 
         adjacent: wp.array3d(dtype=wp.uint32)  # [P, n, words] neighbours of a node among those not yet eliminated

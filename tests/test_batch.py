@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches: environments are independent to the last bit, failures stay where they are, parameters differ per environment."""
 
+import re
+
 import numpy as np
 import pytest
 import warp as wp
@@ -8,6 +10,7 @@ from conftest import DEVICE, block_on_plane, paper_box, random_quaternions, simu
 from conftest import GRAVITY as G
 
 import warp_lcp as wl
+from warp_lcp import methods
 
 
 def bits(sim: wl.Simulator) -> np.ndarray:
@@ -101,6 +104,39 @@ def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
         assert sim.q.strides[0] < sim.q.strides[1]
         sim.step(200)
         assert (bits(sim) == same).all()
+
+
+@pytest.mark.parametrize("name", ["ProximalNewton", "BlockPGS"])
+def test_a_method_that_is_stopped_says_so(monkeypatch, name):
+    """Alone and without a single sweep or step: not certified, and the limit is named as what stopped it."""
+    method = getattr(methods, name)
+    monkeypatch.setattr(method, "SWEEPS", 0)
+    monkeypatch.setattr(method, "LIMIT", 0, raising=False)
+    sim = simulator(paper_box(), method={"ProximalNewton": "proximal_newton", "BlockPGS": "pgs"}[name])
+    sim.step()
+    assert sim.status.numpy()[0] == wl.Status.ITERATION_LIMIT | wl.Status.UNCERTIFIED
+    assert sim.residual.numpy()[0] == pytest.approx(G * 1e-3)  # no impulse at all
+
+
+@pytest.mark.parametrize("method", ["velocity_pivoting", "proximal_newton", "lemke"])
+def test_workspaces_take_what_they_are_counted_at(monkeypatch, method):
+    """Scalars a workspace, by which a GPU's memory is shared out, against the bytes that three of them take: 40 boxes."""
+    counted = []
+
+    def workspaces(envs, scalars, device):
+        counted.append(scalars)
+        return 3
+
+    monkeypatch.setattr("warp_lcp.methods.workspaces", workspaces)
+    builder = wl.ModelBuilder()
+    builder.add_plane()
+    for k in range(40):
+        builder.add_box(builder.add_body(pose=(0.3 * k, 0, 0.1, 0, 0, 0, 1)), (0.1, 0.1, 0.1))
+    (made,) = simulator(builder, method=method)._methods
+    parts = [part for value in vars(made).values() for part in (value if isinstance(value, tuple) else (value,))]
+    arrays = [getattr(part, name) for part in parts if hasattr(part, "_cls") for name in part._cls.vars]
+    total = sum(a.capacity for a in arrays if a is not None and a.shape[0] == 3)
+    assert total / 3 == pytest.approx(8 * counted[0], rel=0.03)
 
 
 def test_a_nan_is_flagged_contained_and_healed_by_a_masked_reset():
@@ -270,6 +306,27 @@ def test_scenes_without_contacts_or_movable_bodies():
 def test_arguments_are_checked(arguments, message):
     with pytest.raises(wl.WarpLcpError, match=message):
         simulator(paper_box(), **arguments)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, None, "2", "two", 2.5, True, -1, [2, 2], 2j], ids=str)
+def test_counts_are_whole_numbers(value):
+    """Anything else is one clear line, whoever asks for the count."""
+    sim = simulator(paper_box())
+    asked = {
+        "num_envs": lambda x: simulator(paper_box(), num_envs=x),
+        "directions": lambda x: simulator(paper_box(), directions=x),
+        "step: count": sim.step,
+        "rollout: steps": sim.rollout,
+        "rollout: every": lambda x: sim.rollout(3, every=x),
+        "solve_contact: directions": lambda x: wl.solve_contact(np.eye(3), np.ones(3), 0.5, directions=x, device="cpu"),
+    }
+    for what, ask in asked.items():
+        with pytest.raises(wl.WarpLcpError, match=rf"^{what} is {re.escape(repr(value))}; give a whole number of at least [012]$"):
+            ask(value)
+    assert sim.time == 0.0
+    for number in (2, 2.0, np.int32(2), np.float64(2.0), np.array(2)):
+        sim.step(number)
+    assert sim.time == pytest.approx(0.01)
 
 
 def test_environments_that_need_another_method_leave_the_others_alone():

@@ -220,6 +220,7 @@ def test_float32_answers_are_as_good_as_it_says(heap):
         ((np.eye(3), np.zeros(3), [0.5, 0.5]), "mu has shape"),
         ((np.eye(3), np.zeros(3), -0.5), "mu is -0.5; it must not be negative"),
         ((np.diag([1, np.nan, 1]), np.zeros(3), 0.5), "W\\[1, 1\\] is nan; it must be finite"),
+        ((np.broadcast_to(0.0, (2, 16386, 16386)), np.zeros((2, 16386)), 0.5), "W has 16386 rows, .* no more than 16383; solve"),
         ((np.eye(3), np.zeros(3), 0.5, "box"), "formulation is 'box'; choose one of coulomb"),
         ((np.eye(3), np.zeros(3), 0.5, "coulomb", "lemke"), "method is 'lemke'; choose one of auto"),
     ],

@@ -6,6 +6,7 @@ import pytest
 from conftest import GRAVITY, block_on_plane, paper_box, simulator, yaw
 
 import warp_lcp as wl
+from warp_lcp.laws import FORMULATIONS, SLIDING, Law
 
 SPEED, MU = 2.0, 0.5
 # Rest pose (x, y, yaw) of the paper's box by an independent exact-cone stepper (Siconos, normals relaxed as here), less the
@@ -36,6 +37,16 @@ def launch(headings, h=2e-3, half=(0.5, 0.5, 0.05), **options):
     assert np.abs(sim.v.numpy()).max() < 1e-9
     assert (sim.status.numpy() == 0).all()
     return sim.q.numpy()[:, :2]
+
+
+def test_options_that_a_law_does_not_ask_for_change_nothing():
+    """As documented: the way to slide is phantom_inertia's own choice, and only the cone has no directions."""
+    for formulation in FORMULATIONS:
+        slides = {Law(formulation, sliding, 4).row_arguments for sliding in SLIDING}
+        sticks = {Law(formulation, directions=k).row_arguments for k in (2, 4, 8)}
+        assert len(slides) == (3 if formulation == "phantom_inertia" else 1)
+        assert len(sticks) == (1 if formulation == "coulomb" else 3)
+        assert len({Law(formulation, sliding, 4).friction for sliding in SLIDING}) == len(slides)
 
 
 @pytest.mark.parametrize("h", SICONOS)

@@ -398,6 +398,11 @@ EYE, ZERO = np.eye(2), np.zeros(2)
         ({"M": [[1, "a"], [0, 1]]}, "M is of <U"),
         ({"M": [[1, 0], [0]]}, "M is no array of numbers"),
         ({"M": EYE * 1j}, "M is of complex128; give real numbers"),
+        ({"M": np.broadcast_to(0.0, (2, 16384, 16384)), "q": np.zeros((2, 16384))}, "M has 16384 rows, .* no more than 16383; solve the"),
+        (
+            {"M": np.broadcast_to(np.float32(0), (2, 23171, 23171)), "q": np.zeros((2, 23171), dtype=np.float32)},
+            "M has 23171 rows, .* no more than 23170; solve the problems one by one",
+        ),
         ({"M": wp.array(EYE, dtype=wp.int32, device="cpu")}, "M is of int32; give float64 or float32"),
         ({"method": "magic"}, "method is 'magic'; choose one of lemke, murty, judice_pires, pgs, auto"),
         ({"tolerance": 0.0}, "tolerance is 0.0"),

@@ -197,7 +197,7 @@ def test_chosen_environments(tmp_path):
     for bad in ([], [1, 1], [100], [-1], 0, 101, [0.5]):
         with pytest.raises(wl.WarpLcpError, match=r"^envs: "):
             wl.RerunLogger(sim, tmp_path / "d.rrd", envs=bad)
-    for bad in (0, -1, 1.5):
+    for bad in (0, -1, 1.5, float("nan"), float("inf"), "2", True):
         with pytest.raises(wl.WarpLcpError, match=r"^every is "):
             wl.RerunLogger(sim, tmp_path / "d.rrd", every=bad)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,17 @@ def device_of(caller: str, device: Any, **arrays: Any) -> Any:
     if any(place != next(iter(places.values())) for place in places.values()):
         raise WarpLcpError(f"{caller}: {' and '.join(f'{n} is on {d}' for n, d in places.items())}; move them together, or say device=")
     return next(iter(places.values()), None) or wp.get_device(None)
+
+
+def check_strides(caller: str, name: str, x: Any, real: Any) -> None:
+    """Kernels reach every problem of a batch [B, n, n]: the bytes from one to the next are a 32-bit number there.
+
+    Beyond that they would read elsewhere, without a word. One problem alone may have any size.
+    """
+    batch, n = (x.shape[0], x.shape[-1]) if x.ndim == 3 else (1, x.shape[-1])
+    most = math.isqrt((2**31 - 1) // wp.types.type_size_in_bytes(real))
+    if batch > 1 and n > most:
+        raise WarpLcpError(f"{caller}: {name} has {n} rows, and Warp takes batches of no more than {most}; solve the problems one by one")
 
 
 def check_finite(caller: str, name: str, x: Any) -> None:

@@ -68,8 +68,15 @@ def _parser() -> _Parser:
         command.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
         add = command.add_argument
         add("--formulation", default="phantom_inertia", metavar="F", help="contact law (default phantom_inertia)")
-        add("--sliding", default="regularized", metavar="S", help="sliding contacts: regularized (default), aligned or facets")
-        add("--directions", type=int, default=2, metavar="K", help="friction directions of a sticking contact (default 2)")
+        add(
+            "--sliding",
+            default="regularized",
+            metavar="S",
+            help="how phantom_inertia (no other law) slides: regularized (default), aligned or facets",
+        )
+        add(
+            "--directions", type=int, default=2, metavar="K", help="friction directions of a sticking contact (default 2); coulomb has none"
+        )
     add = run.add_argument
     add("--envs", type=int, default=1, metavar="N", help="environments, all alike (default 1)")
     add("--dt", type=float, default=1e-3, metavar="S", help="step size in seconds (default 0.001)")

@@ -76,7 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("file", metavar="FILE.npz", help=f"one problem or a batch, by the names of its arrays ({files})")
     add("--method", metavar="M", help="solution method (default: lemke for an LCP, auto for a contact problem)")
     add("--formulation", metavar="F", help="contact problem: coulomb (default), phantom_inertia or anitescu_potra")
-    add("--directions", type=int, metavar="K", help="contact problem: k of the facets (default 2)")
+    add("--directions", type=int, metavar="K", help="contact problem: k of the facets (default 2); coulomb has none")
     add(
         "--tolerance",
         type=float,

@@ -1,6 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors that a user can mend: each says what is wrong, where, and how to put it right."""
 
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
 
 class WarpLcpError(ValueError):
     """Base of every error raised for bad input; the command line prints it as one line and exits with status 2."""
@@ -23,3 +30,16 @@ class MissingExtra(WarpLcpError, ImportError):
 
     def __init__(self, purpose: str, extra: str, cause: ImportError):
         super().__init__(f"{purpose} needs the extra '{extra}': python -m pip install 'warp_lcp[{extra}]' ({cause})")
+
+
+def whole_number(what: str, value: Any, least: int) -> int:
+    """A count that a user gives, as an int: 2, 2.0 and numpy's kinds of 2 are whole numbers, True and "2" are none.
+
+    Raises:
+        WarpLcpError: for anything else, NaN and infinity included, and for less than `least`.
+    """
+    with suppress(TypeError, ValueError, OverflowError):
+        number = int(value)
+        if number == value and number >= least and not isinstance(value, (bool, np.bool_)):
+            return number
+    raise WarpLcpError(f"{what} is {value!r}; give a whole number of at least {least}")

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .arrays import check_finite, device_of, is_single, on_device, read
-from .errors import WarpLcpError
+from .arrays import check_finite, check_strides, device_of, is_single, on_device, read
+from .errors import WarpLcpError, whole_number
 from .kernels import contact_problem
 from .kernels.types import LANES
 from .methods import contact_workspace, workspaces
@@ -74,7 +74,7 @@ def solve_contact(
         mu: [B, r], [r] or one number, friction coefficients.
         formulation: 'coulomb', 'phantom_inertia' or 'anitescu_potra'.
         method: 'auto' (the proximal Newton method), 'proximal_newton' or 'pgs' (block Gauss-Seidel).
-        directions: k of the polygons, at angles j pi / k from t1.
+        directions: k of the polygons, at angles j pi / k from t1; 'coulomb' has none.
         tolerance: largest residual of an answer that counts as solved, in parts of max |q|; None = 1e-10, in float32 1e-4.
         device: Warp device; None = that of W and q if they are on one, Warp's default otherwise.
 
@@ -104,14 +104,14 @@ def prepare(
         raise WarpLcpError(
             f"solve_contact: method is {method!r}; choose one of {', '.join(METHODS)} (methods for LCPs are behind solve_lcp)"
         )
-    if int(directions) != directions or directions < 2:
-        raise WarpLcpError(f"solve_contact: directions is {directions}; give a whole number of at least 2")
+    directions = whole_number("solve_contact: directions", directions, 2)
     me = "solve_contact"
     W, q, mu = read(me, "W", W), read(me, "q", q), read(me, "mu", mu)
     if W.ndim not in (2, 3) or W.ndim != q.ndim + 1 or W.shape != (*q.shape, q.shape[-1]) or q.shape[-1] % 3:
         raise WarpLcpError(f"{me}: W has shape {tuple(W.shape)} and q {tuple(q.shape)}; give [B, 3r, 3r] and [B, 3r], or [3r, 3r] and [3r]")
     real = wp.float32 if is_single(W) and is_single(q) else wp.float64
     device = device_of(me, device, W=W, q=q)
+    check_strides(me, "W", W, real)
     for name, x in (("W", W), ("q", q), ("mu", mu)):
         check_finite(me, name, x)
     W, q = on_device(W, real, device), on_device(q, real, device)
@@ -134,7 +134,7 @@ def prepare(
     if batch == 0 or contacts == 0:
         return solution, None
     sweeps, limit = METHODS[method]
-    inputs = [W, q, mu, int(code), limit, sweeps, tolerance]
+    inputs = [W, q, mu, code, limit, sweeps, tolerance]
     if device.is_cpu and contacts <= SMALL:
         inputs += _kept_workspace(real, contacts, str(device), threading.get_ident())
     else:

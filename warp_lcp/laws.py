@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from .errors import WarpLcpError
+from .errors import WarpLcpError, whole_number
 
 FORMULATIONS = ("phantom_inertia", "anitescu_potra", "box", "hybrid", "coulomb")
 SLIDING = ("regularized", "aligned", "facets")
@@ -18,8 +18,8 @@ class Law:
 
     Attributes:
         formulation: one of FORMULATIONS.
-        sliding: one of SLIDING, for 'phantom_inertia'; the others have their own way to slide.
-        directions: k of a sticking contact, at least 2; 'coulomb' has none.
+        sliding: one of SLIDING, for 'phantom_inertia'; the others have their own way to slide, whatever it says.
+        directions: k of a sticking contact, at least 2; 'coulomb' has none, whatever it says.
 
     Raises:
         WarpLcpError: where there is no such law.
@@ -33,9 +33,7 @@ class Law:
         for name, choices in (("formulation", FORMULATIONS), ("sliding", SLIDING)):
             if getattr(self, name) not in choices:
                 raise WarpLcpError(f"{name} is {getattr(self, name)!r}; choose one of {', '.join(choices)}")
-        if int(self.directions) != self.directions or self.directions < 2:
-            raise WarpLcpError(f"directions is {self.directions}; give a whole number of at least 2")
-        object.__setattr__(self, "directions", int(self.directions))  # 2.0 is a whole number, but not for a kernel
+        object.__setattr__(self, "directions", whole_number("directions", self.directions, 2))  # 2.0 is none for a kernel
 
     @property
     def row_arguments(self) -> tuple[int, int, int]:

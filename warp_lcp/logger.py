@@ -37,7 +37,7 @@ from urllib.parse import quote, urlsplit
 import numpy as np
 import warp as wp
 
-from .errors import MissingExtra, WarpLcpError
+from .errors import MissingExtra, WarpLcpError, whole_number
 from .kernels.watch import collect_status
 from .model import JointType, Model, ShapeType
 from .simulator import INFORMATIVE, Simulator, Status
@@ -116,9 +116,8 @@ class RerunLogger:
         self._rr = _import_rerun()
         self.sim, model = sim, sim.model
         self.envs = _chosen(envs, sim.num_envs)
-        self.every = max(1, math.ceil(1.0 / (FRAME_RATE * sim.dt) - 1e-9)) if every is None else every
-        if isinstance(self.every, bool) or self.every != int(self.every) or self.every < 1:
-            raise WarpLcpError(f"every is {every}; give a whole number of at least 1, the steps between two frames")
+        usual = max(1, math.ceil(1.0 / (FRAME_RATE * sim.dt) - 1e-9))
+        self.every = usual if every is None else whole_number("every", every, 1)
         self._ids: Any = None if len(self.envs) == sim.num_envs else wp.array(self.envs, dtype=int, device=sim.device)
         self._seen = wp.zeros(sim.num_envs, dtype=int, device=sim.device)
         self._warned = np.zeros(sim.num_envs, dtype=bool)

@@ -50,7 +50,8 @@ def lcp_workspace(real: Any, slots: int, n: int, device: Any) -> Any:
 def graph_workspace(real: Any, size: int, slots: int, n: int, blocks: int, fill: int, device: Any) -> Any:
     """Graph of `slots` block-sparse systems of at most n nodes, blocks of size x size (kernels/sparse.py).
 
-    blocks: room for pairs of neighbours, each counted twice; fill: room for blocks of a triangular factor.
+    blocks: room for pairs of neighbours, each counted twice; fill: room for blocks of a triangular factor. Graph.diagonal and
+    Graph.block are left to callers who keep the matrix as well as its factors.
     """
     graph = sparse.functions(real, size).Graph()
     matrix = graph._cls.vars["pivot"].type.dtype
@@ -62,22 +63,24 @@ def graph_workspace(real: Any, size: int, slots: int, n: int, blocks: int, fill:
     graph.degree, graph.order, graph.step = (empty(n, int) for _ in range(3))
     graph.row, graph.fill = empty(n + 1, int), empty(n + 1, int)
     graph.column, graph.target, graph.later = empty(blocks, int), empty(blocks, int), empty(fill, int)
-    graph.diagonal, graph.pivot = empty(n, matrix), empty(n, matrix)
-    graph.block, graph.lower, graph.upper = empty(blocks, matrix), empty(fill, matrix), empty(fill, matrix)
+    graph.pivot, graph.lower, graph.upper = empty(n, matrix), empty(fill, matrix), empty(fill, matrix)
     return graph
 
 
 def contact_workspace(real: Any, slots: int, n: int, blocks: int, fill: int, device: Any) -> tuple[Any, Any]:
     """Graph and ContactProblem of `slots` problems of at most n contacts, for the proximal kernels."""
     t, problem = scalar_types(real), proximal.functions(real).ContactProblem()
+    graph = graph_workspace(real, 3, slots, n, blocks, fill, device)
 
     def empty(dtype: Any) -> wp.array:
         return wp.empty((slots, max(n, 1)), dtype=dtype, device=device)
 
+    graph.diagonal, graph.block = empty(t.mat33), wp.empty((slots, max(blocks, 1)), dtype=t.mat33, device=device)  # W
+
     problem.free, problem.rho, problem.impulse, problem.velocity = (empty(t.vec3) for _ in range(4))
     problem.centre, problem.best, problem.first, problem.step, problem.change = (empty(t.vec3) for _ in range(5))
     problem.mu, problem.bound, problem.directions, problem.error = empty(t.vec2), empty(t.vec2), empty(int), empty(real)
-    return graph_workspace(real, 3, slots, n, blocks, fill, device), problem
+    return graph, problem
 
 
 def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
@@ -148,7 +151,7 @@ class ProximalNewton(Method):
     def prepare(self, sim: Simulator) -> None:
         n = sim.model.max_contacts
         blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
-        self.slots = workspaces(sim.num_envs, 10 * blocks + 20 * fill, sim.device)
+        self.slots = workspaces(sim.num_envs, 53 * n + 10 * blocks + 19 * fill, sim.device)
         self.workspace = contact_workspace(sim.real, self.slots, n, blocks, fill, sim.device)
 
     def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
@@ -187,7 +190,7 @@ class VelocityPivoting(Method):
             return
         n, contacts = len(self.movable), sim.model.max_contacts
         blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
-        self.slots = workspaces(sim.num_envs, 72 * (n + fill) + 14 * contacts, sim.device)
+        self.slots = workspaces(sim.num_envs, 54 * n + blocks + 73 * fill + 13 * contacts, sim.device)
         self.graph = graph_workspace(sim.real, 6, self.slots, n, blocks, fill, sim.device)
         ws = self.workspace = self.parts.Workspace()
         number = np.full(sim.model.num_bodies, -1, dtype=np.int32)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from .errors import WarpLcpError
+from .errors import WarpLcpError, whole_number
 from .kernels import record as recording
 
 if TYPE_CHECKING:
@@ -67,9 +67,7 @@ class Recorder:
     def run(self, steps: int, wrench: Any, record: Any, every: int) -> Rollout:
         """See Simulator.rollout."""
         sim, k = self.sim, self.kernels
-        for name, value, least in (("steps", steps, 1), ("every", every, 1)):
-            if not isinstance(value, (int, np.integer)) or value < least:
-                raise WarpLcpError(f"rollout: {name} is {value!r}; give a whole number of at least {least}")
+        steps, every = whole_number("rollout: steps", steps, 1), whole_number("rollout: every", every, 1)
         if every > steps:
             raise WarpLcpError(f"rollout: every is {every}, more than the {steps} steps: no row would be recorded")
         if not isinstance(record, Iterable):

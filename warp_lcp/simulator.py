@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .errors import SimulationError, WarpLcpError
+from .errors import SimulationError, WarpLcpError, whole_number
 from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset, restitution
 from .kernels.types import scalar_types
 from .laws import Law
@@ -90,8 +90,9 @@ class Simulator:
         method: how the contact problem is solved: 'velocity_pivoting', 'proximal_newton', 'pgs', 'lemke', 'murty', 'judice_pires', or
             'auto': velocity pivoting where the law has axes (not in float32), then the proximal Newton method, then pgs, each for
             the environments that are not solved by then.
-        sliding: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes throughout).
-        directions: k, friction directions of a sticking contact, at least 2.
+        sliding: how 'phantom_inertia' slides: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes
+            throughout). The other laws do not ask: 'hybrid' is regularized, 'anitescu_potra' and 'box' have facets, 'coulomb' the cone.
+        directions: k, friction directions of a sticking contact (with facets, of a sliding one too), at least 2; 'coulomb' has none.
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
         precision: 'float64' or 'float32', of state and solution.
         integrator: 'euler', q+ = q + h Gamma v+ (eq. 23), or 'midpoint', q+ = q + h Gamma (v + v+) / 2 but for bodies that
@@ -134,13 +135,11 @@ class Simulator:
         _choice("method", method, tuple(METHODS))
         _choice("precision", precision, tuple(PRECISIONS))
         _choice("integrator", integrator, INTEGRATORS)
-        if int(num_envs) != num_envs or num_envs < 1:
-            raise WarpLcpError(f"num_envs is {num_envs}; give a whole number of at least 1")
         if not (np.isfinite(dt) and dt > 0.0):
             raise WarpLcpError(f"dt is {dt} s; it must be finite and greater than zero")
         if not (np.isfinite(rho_scale) and rho_scale > 0.0):
             raise WarpLcpError(f"rho_scale is {rho_scale}; it must be finite and greater than zero")
-        self.model, self.num_envs, self.dt = model, int(num_envs), float(dt)
+        self.model, self.num_envs, self.dt = model, whole_number("num_envs", num_envs, 1), float(dt)
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
         self.directions, self.rho_scale, self.strict = self.law.directions, float(rho_scale), bool(strict)
@@ -164,9 +163,7 @@ class Simulator:
 
     def step(self, count: int = 1) -> None:
         """Advance every environment by ``count`` steps (0 only prepares)."""
-        if int(count) != count or count < 0:
-            raise WarpLcpError(f"step: count is {count}; give a whole number of at least 0")
-        count = int(count)
+        count = whole_number("step: count", count, 0)
         graph = self._captured("step", self._step_kernels)
         self.status.zero_()
         self.iterations.zero_()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .arrays import check_finite, device_of, is_single, on_device, read
+from .arrays import check_finite, check_strides, device_of, is_single, on_device, read
 from .errors import WarpLcpError
 from .kernels import solve_batch
 from .kernels.types import LANES
@@ -89,6 +89,7 @@ def solve_lcp(
         raise WarpLcpError(f"solve_lcp: M has shape {tuple(M.shape)} and q {tuple(q.shape)}; give [B, n, n] and [B, n], or [n, n] and [n]")
     real = wp.float32 if is_single(M) and is_single(q) else wp.float64
     device = device_of("solve_lcp", device, M=M, q=q)
+    check_strides("solve_lcp", "M", M, real)
     check_finite("solve_lcp", "M", M)
     check_finite("solve_lcp", "q", q)
     M, q = on_device(M, real, device), on_device(q, real, device)

@@ -22,11 +22,11 @@ from .recorded import Problem
 
 def rates() -> dict[str, float]:
     """Bytes/s of reading memory and flop/s of a product of matrices in the cache, by processor time: of one core however many work."""
-    large, a = np.ones(2**25), np.ones((240, 240))
+    large, a = np.ones(2**25), np.ones((100, 100))  # larger ones wake threads whose waiting would count
 
     def best(action: Any) -> float:
         times = []
-        for _ in range(5):
+        for _ in range(10):
             begin = time.process_time()
             action()
             times.append(time.process_time() - begin)

@@ -88,7 +88,7 @@ PEERS = {
         Peer(
             "newton_xpbd",
             ("newton==1.8.0", "warp-lang==1.19.0"),
-            {"2 iterations": {"iterations": 2}, "20 iterations": {"iterations": 20}},
+            {f"{n} iterations": {"iterations": n} for n in (2, 10, 20)},
         ),
     )
 }

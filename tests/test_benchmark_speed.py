@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `speed` says besides env-steps/s: mass ratios, environments that fail the first method, floors of the kernels."""
+
+import inspect
+
+import numpy as np
+import pytest
+import warp as wp
+
+import warp_lcp as wl
+from benchmarks import goals, scenes, step_floor
+
+
+def test_mass_ratio():
+    """1000:1 sinks by its compliance, 1e6:1 by a little more than that; nothing moves sideways, and the goal is said to be reached."""
+    light, heavy = goals.stack(1e3, 1), goals.stack(1e6, 1)
+    assert light["z_error"] == pytest.approx(light["z_compliance"], rel=1e-3)
+    assert heavy["z_error"] == pytest.approx(heavy["z_compliance"], rel=0.05)
+    for row in (light, heavy):
+        assert row["marked_steps"] == 0
+        assert row["lateral_error"] < 1e-9
+        assert 0.0 < row["step_best_s"] <= row["step_s"]
+    assert "us: reached" in goals.markdown([light | {"step_s": 9e-5}], [])
+    assert "us: MISSED" in goals.markdown([light | {"step_s": 2e-4}], [])
+    assert "us: MISSED" in goals.markdown([light | {"step_s": 9e-5, "z_error": 3e-5}], [])
+
+
+def test_one_percent_that_fails_the_first_method():
+    """Just those ten are handed on, and the next method solves them."""
+    row = goals.failing(wp.get_device("cpu"), "rest", 1)
+    assert (row["failing_envs"], row["most_handed_on"], row["marked_envs"]) == (10, 10, 0)
+    assert row["ratio"] > 0.0
+    assert "1.5: MISSED" in goals.markdown([], [row | {"ratio": 1.6}])
+
+
+def every_array(inputs) -> dict[str, wp.array]:
+    """Arrays of a launch, by parameter or parameter.field."""
+    found = {}
+    for name, value in inputs.items():
+        if isinstance(value, wp.array):
+            found[name] = value
+        elif hasattr(value, "_cls"):
+            found |= {f"{name}.{field}": getattr(value, field) for field in value._cls.vars}
+    return {name: array for name, array in found.items() if isinstance(array, wp.array) and array.size}
+
+
+def launched(sim: wl.Simulator) -> list:
+    """(kernel, repeatable launch, arrays by name) of the next step."""
+    with step_floor.caught() as launches:
+        sim._step_kernels()
+    return [(k, c, every_array(dict(zip(inspect.signature(k.func).parameters, i, strict=True)))) for k, c, i in launches]
+
+
+def stacked() -> wl.Simulator:
+    """Boxes on boxes, that bounce, by the midpoint rule and on the cone."""
+    builder = wl.ModelBuilder()
+    builder.add_plane(material=wl.Material(restitution=0.5))
+    for k in range(3):
+        builder.add_box(builder.add_body(pose=(0, 0, 0.12 + 0.21 * k, 0, 0, 0, 1), velocity=(0.2, 0, -1)), (0.1, 0.1, 0.1))
+    return wl.Simulator(builder.finalize(), 2, integrator="midpoint", formulation="coulomb", device="cpu")
+
+
+def other(x: np.ndarray) -> np.ndarray:
+    """Numbers that differ everywhere; small ones where they are integers, which may be indices."""
+    return (x == 0).astype(x.dtype) if x.dtype.kind in "iub" else np.full_like(x, 77)
+
+
+@pytest.mark.parametrize("make", [lambda: scenes.scene("slide", 4).simulator(device="cpu"), stacked], ids=["slide", "stacked"])
+def test_sources_say_what_kernels_touch(make):
+    """Nothing else changes, and numbers that are said not to be read may be anything."""
+    sim = make()
+    sim.step(30)
+    checked = 0
+    for kernel, command, arrays in launched(sim):
+        read, written = step_floor.touched(kernel.func)
+        before = {name: array.numpy().copy() for name, array in arrays.items()}
+        command.launch()
+        after = {name: array.numpy().copy() for name, array in arrays.items()}
+        used = {arrays[name].ptr for name in (read | written) & set(arrays)}
+        for name, array in arrays.items():
+            array.assign(before[name])
+            if array.ptr not in {arrays[w].ptr for w in written & set(arrays)}:
+                assert before[name].tobytes() == after[name].tobytes(), f"{step_floor.name_of(kernel)} writes {name}"
+            if array.ptr not in used:
+                array.assign(other(before[name]))
+                checked += 1
+        command.launch()
+        for name, array in arrays.items():
+            if array.ptr in used:
+                assert array.numpy().tobytes() == after[name].tobytes(), f"{step_floor.name_of(kernel)} needs more for {name}"
+            array.assign(before[name])
+        command.launch()
+    assert checked > 50
+
+
+def test_floor_of_a_step():
+    """Of the box at rest: every launch has bytes and a time, and no launch is faster than its floor."""
+    data = step_floor.measure(quick=True)
+    *launches, total, step = data["rows"]
+    assert data["contacts"] == 4.0
+    for row in launches:
+        assert row["read_bytes"] > 0.0
+        assert row["written_bytes"] > 0.0
+    assert total["read_bytes"] == sum(row["read_bytes"] for row in launches)
+    assert total["flops"] == pytest.approx(sum(row["flops"] for row in launches))
+    assert step["ns"] > max(step["memory_floor_ns"], step["arithmetic_floor_ns"])
+    assert f"| {launches[0]['kernel']} |" in step_floor.markdown(data)
+
+
+def test_flops_of_fused_stages():
+    """A kernel that is no stage does what stages without a kernel do; several such share it in the sum alone."""
+    stages = {"a": 1.0, "b": 10.0, "c": 100.0}
+    rows = [{"kernel": name} for name in ("a", "b", "c", "a")]
+    assert step_floor.count_flops(rows, stages) == 112.0
+    rows = [{"kernel": name} for name in ("a", "fused", "a")]
+    assert step_floor.count_flops(rows, stages) == 112.0
+    assert [row["flops"] for row in rows] == [1.0, 110.0, 1.0]
+    rows = [{"kernel": name} for name in ("a", "x", "y")]
+    assert step_floor.count_flops(rows, stages) == 111.0
+    assert [row["flops"] for row in rows] == [1.0, 0.0, 0.0]
