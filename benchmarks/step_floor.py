@@ -153,14 +153,15 @@ def flops(n: float, p: float, s: float) -> dict[str, float]:
     assembly = 2 * (3 + 9 + 9 + 6) + (3 + 9 + 9 + 6) + 3 + 3 * 45 + 4 * 9 + 3 + 9 + 3
     update = (3 + 9 + 3) + (15 + 3) + 12 + 25  # J x, u~, impulse, signs
     elimination = sum(1 + 3 * m + 2 * m * m for m in range(6)) + 36
+    rows = n * (6 + 3 * (3 + mobility + 1) + row + 15 + 3)
+    pivoting = 42 + 1 + s * (n * (assembly + update) + elimination)
+    certificate = 18 + 6 + n * ((15 + 3 + 9 + 6) + (3 + 12 + 15 + 3 + 3) + 3 + 25 + 6 + 10 + 9 + 12 + 21)
     return {
         "kinematics": 7 + 1 + 4,
         "free_motion": pose + 1 + 24 + 12 + 2 * 15 + gyroscopic + 15 + 42 + 2 * 45,
         "plane_box": pose + 33 + 6 + 2 * 30 + 24 + 8 * (15 + 3 + 3 + 5 + 1) + p * 7,
         "select_contacts": 9 + p * (3 + 2 * (12 + 6) + 6 + 3),
-        "contact_rows": n * (6 + 3 * (3 + mobility + 1) + row + 15 + 3),
-        "pivot_single": 42 + 1 + s * (n * (assembly + update) + elimination),
-        "certify": 18 + 6 + n * ((15 + 3 + 9 + 6) + (3 + 12 + 15 + 3 + 3) + 3 + 25 + 6 + 10 + 9 + 12 + 21),
+        "solve_single": rows + pivoting + certificate,
         "integrate": (6 + 1 + 9 + 5) + (3 + 33 + 9 + 28 + 12),
     }
 
@@ -199,12 +200,13 @@ def measure(quick: bool) -> dict[str, Any]:
     if sim.status.numpy().any():
         raise RuntimeError("an environment at rest is not OK")
 
-    rows = []
+    rows: list[dict[str, Any]] = []
+    counted = flops(contacts(sim), points(sim), solves / (WARM_UP + 1))
     for (kernel, _, inputs), seconds in zip(launches, best, strict=True):
         read, written = moved(sim, kernel, inputs)
-        rows.append({"kernel": name_of(kernel), "ns": 1e9 * seconds / ENVS, "read_bytes": read, "written_bytes": written})
-    all_flops = count_flops(rows, flops(contacts(sim), points(sim), solves / (WARM_UP + 1)))
-    total = {key: sum(row[key] for row in rows) for key in ("ns", "read_bytes", "written_bytes")} | {"flops": all_flops}
+        row = {"kernel": name_of(kernel), "ns": 1e9 * seconds / ENVS, "read_bytes": read, "written_bytes": written}
+        rows.append(row | {"flops": counted[name_of(kernel)]})
+    total = {key: sum(row[key] for row in rows) for key in ("ns", "read_bytes", "written_bytes", "flops")}
     total_bytes = total["read_bytes"] + total["written_bytes"]
     rate = rates() | {"copy_bytes_per_s": copy_rate(ENVS * total_bytes), "copied_bytes": ENVS * total_bytes}
     rows += [{"kernel": "sum", **total}, {"kernel": "a step, replayed", **total, "ns": 1e9 * step / ENVS}]
@@ -212,20 +214,6 @@ def measure(quick: bool) -> dict[str, Any]:
         row["memory_floor_ns"] = 1e9 * (row["read_bytes"] + row["written_bytes"]) / rate["copy_bytes_per_s"]
         row["arithmetic_floor_ns"] = 1e9 * row["flops"] / rate["flops_per_s"]
     return {"rates": rate, "envs": ENVS, "contacts": contacts(sim), "rows": rows}
-
-
-def count_flops(rows: list[dict[str, Any]], stages: dict[str, float]) -> float:
-    """Flops of each launch; returns those of all.
-
-    What stages without a kernel of their own take belongs to the kernel that is no stage: they are fused. Of several such kernels
-    none gets any, for nobody knows which does what; then only their sum is right.
-    """
-    names = [row["kernel"] for row in rows]
-    others = [name for name in names if name not in stages]
-    rest = sum(count for name, count in stages.items() if name not in names)
-    for row in rows:
-        row["flops"] = stages.get(row["kernel"], rest if len(others) == 1 else 0.0)
-    return sum(stages[name] for name in names if name in stages) + rest
 
 
 def markdown(data: dict[str, Any]) -> str:

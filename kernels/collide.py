@@ -145,17 +145,16 @@ def make(real) -> dict:
             near += reach(topology, bodies, env, topology.pairs[pair, 1], centre, radius, h)
             turn = wp.quat_to_matrix(wp.transform_get_rotation(box))
             slot = topology.pair_slots[pair]
+            above = wp.dot(normal, centre - origin)
+            rise = wp.cw_mul(normal * turn, size)  # of a corner over the centre, along each axis of the box
             for k in range(8):
-                corner = size
-                if (k & 1) == 0:
-                    corner[0] = -size[0]
-                if (k & 2) == 0:
-                    corner[1] = -size[1]
-                if (k & 4) == 0:
-                    corner[2] = -size[2]
-                vertex = centre + turn * corner
-                gap = wp.dot(normal, vertex - origin)
+                side = vec3(real(-1.0), real(-1.0), real(-1.0))
+                for axis in range(3):
+                    if (k & (1 << axis)) != 0:
+                        side[axis] = real(1.0)
+                gap = above + side[0] * rise[0] + side[1] * rise[1] + side[2] * rise[2]
                 if gap < near:
+                    vertex = centre + turn * wp.cw_mul(side, size)
                     write(slots, env, slot + k, vertex - normal * (real(0.5) * gap), normal, gap, k)
                 else:
                     slots.gap[env, slot + k] = real(NO_POINT)

@@ -357,6 +357,7 @@ def make(real) -> SimpleNamespace:
         start, _ = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
             fall = h * h * wp.length(parameters.gravity[env % parameters.gravity.shape[0]]) + real(1.0e-9)
+            reach = real(4.0) * h * h
             count = int(0)
             for slot in range(slots.gap.shape[1]):
                 phi = slots.gap[env, slot]
@@ -364,7 +365,8 @@ def make(real) -> SimpleNamespace:
                     u, u_free = velocities(topology, bodies, env, topology.slot_pair[slot], slots.point[env, slot])
                     # Twice the speed counts, not its approaching part: an impact elsewhere on the body turns one into the
                     # other (1.1 mm of overlap at 1 ms with the approaching part alone, 3 um with this).
-                    if phi < real(2.0) * h * wp.length(u_free) + fall:
+                    ahead = phi - fall
+                    if ahead < real(0.0) or ahead * ahead < reach * wp.length_sq(u_free):
                         if count < contacts.slot.shape[1]:
                             contacts.slot[env, count] = slot
                             contacts.velocity[env, count] = u
