@@ -232,10 +232,10 @@ def functions(real, size: int) -> SimpleNamespace:
         """L and U of a block in one matrix: L below the diagonal, U above, 1 / U_kk on it."""
         for k in range(size):
             a[k, k] = real(1.0) / a[k, k]
-            for i in range(k + 1, size):
+            for i in range(wp.static(k + 1), size):
                 f = a[i, k] * a[k, k]
                 a[i, k] = f
-                for j in range(k + 1, size):
+                for j in range(wp.static(k + 1), size):
                     a[i, j] = a[i, j] - f * a[k, j]
         return a
 
@@ -249,10 +249,9 @@ def functions(real, size: int) -> SimpleNamespace:
                 for j in range(k):
                     t -= y[j] * lu[j, k]
                 y[k] = t * lu[k, k]
-            for kk in range(size):
-                k = size - 1 - kk
+            for k in range(wp.static(size - 1), -1, -1):
                 t = y[k]
-                for j in range(k + 1, size):
+                for j in range(wp.static(k + 1), size):
                     t -= y[j] * lu[j, k]
                 y[k] = t
             x[i] = y
@@ -266,10 +265,9 @@ def functions(real, size: int) -> SimpleNamespace:
             for j in range(i):
                 t -= lu[i, j] * y[j]
             y[i] = t
-        for ii in range(size):
-            i = size - 1 - ii
+        for i in range(wp.static(size - 1), -1, -1):
             t = y[i]
-            for j in range(i + 1, size):
+            for j in range(wp.static(i + 1), size):
                 t -= lu[i, j] * y[j]
             y[i] = t * lu[i, i]
         return y
