@@ -78,26 +78,19 @@ def polygon(real) -> SimpleNamespace:
         edge: vec8i  # which line leads from this vertex to the next: 0-3 incident face, 4-7 clipping planes
 
     @wp.func
-    def append(p: Polygon, x: real, y: real, z: real, edge: int):
-        if p.count < 8:
-            p.x[p.count] = x
-            p.y[p.count] = y
-            p.z[p.count] = z
-            p.edge[p.count] = edge
-            p.count += 1
-        return p
-
-    @wp.func
     def clip(p: Polygon, plane: int, half: real):
         """Keep the part within one side of the reference face; plane = 0..3 for x <= half, -x <= half, y.., -y.."""
         result = Polygon()
+        count = int(0)
         sign = real(1.0)
         if plane % 2 == 1:
             sign = real(-1.0)
         # A corner that lies on the side keeps its identity, whatever the last bits say.
         slack = half * real(1.0e-4)
         for k in range(p.count):
-            m = (k + 1) % p.count
+            m = k + 1
+            if m == p.count:
+                m = 0
             here = sign * p.x[k] - half
             there = sign * p.x[m] - half
             if plane >= 2:
@@ -105,19 +98,25 @@ def polygon(real) -> SimpleNamespace:
                 there = sign * p.y[m] - half
             keep_here = here <= slack
             keep_there = there <= slack
-            if keep_here:
-                result = append(result, p.x[k], p.y[k], p.z[k], p.edge[k])
-            if keep_here != keep_there:
+            if keep_here and count < 8:
+                result.x[count] = p.x[k]
+                result.y[count] = p.y[k]
+                result.z[count] = p.z[k]
+                result.edge[count] = p.edge[k]
+                count += 1
+            if keep_here != keep_there and count < 8:
                 s = wp.clamp(here / (here - there), real(0.0), real(1.0))
-                edge = p.edge[k]
+                result.x[count] = p.x[k] + s * (p.x[m] - p.x[k])
+                result.y[count] = p.y[k] + s * (p.y[m] - p.y[k])
+                result.z[count] = p.z[k] + s * (p.z[m] - p.z[k])
+                result.edge[count] = p.edge[k]
                 if keep_here:
-                    edge = 4 + plane
-                result = append(
-                    result, p.x[k] + s * (p.x[m] - p.x[k]), p.y[k] + s * (p.y[m] - p.y[k]), p.z[k] + s * (p.z[m] - p.z[k]), edge
-                )
+                    result.edge[count] = 4 + plane
+                count += 1
+        result.count = count
         return result
 
-    return SimpleNamespace(Polygon=Polygon, append=append, clip=clip)
+    return SimpleNamespace(Polygon=Polygon, clip=clip)
 
 
 @functools.cache
@@ -129,7 +128,7 @@ def make(real):
     f, a, p = pair_functions(real), axes(real), polygon(real)
     shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
     face_separation, edge_axis, edge_separation, column, rank = a.face_separation, a.edge_axis, a.edge_separation, a.column, a.rank
-    Polygon, append, clip = p.Polygon, p.append, p.clip
+    Polygon, clip = p.Polygon, p.clip
 
     @wp.func
     def face_contacts(
@@ -189,7 +188,11 @@ def make(real):
             if k >= 2:
                 s2 = real(-1.0)
             v = d + column(rotation, j) * (top * hi[j]) + column(rotation, j1) * (s1 * hi[j1]) + column(rotation, j2) * (s2 * hi[j2])
-            corners = append(corners, v[x_axis], v[y_axis], side * v[axis] - hr[axis], k)
+            corners.x[k] = v[x_axis]
+            corners.y[k] = v[y_axis]
+            corners.z[k] = side * v[axis] - hr[axis]
+            corners.edge[k] = k
+        corners.count = 4
         corners = clip(corners, 0, hr[x_axis])
         corners = clip(corners, 1, hr[x_axis])
         corners = clip(corners, 2, hr[y_axis])
