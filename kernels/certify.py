@@ -54,12 +54,17 @@ def functions(real) -> SimpleNamespace:
         return error, energy, u - shift, contact_state(p, mu, bound, k)
 
     @wp.func
-    def remember(slots: Slots, env: int, slot: int, rate: real, frame: mat33, p: vec3, u: vec3, b_t: real):
-        """History for the next step: the feature that touched, its normal impulse and bristle force (eq. 42); rate = 1 / h."""
-        bristle = vec3(real(0.0), p[1] * rate + b_t * u[1], p[2] * rate + b_t * u[2])
-        slots.last_feature[env, slot] = slots.feature[env, slot]
-        slots.last_impulse[env, slot] = p[0]
-        slots.last_bristle[env, slot] = wp.transpose(frame) * bristle
+    def remember(slots: Slots, env: int, slot: int, closed: int, rate: real, frame: mat33, p: vec3, u: vec3, b_t: real):
+        """History for the next step: the feature that touched, its normal impulse and bristle force (eq. 42); rate = 1 / h.
+
+        An unloaded contact is remembered as such; one that never closed will be new when it does.
+        """
+        slots.last_feature[env, slot] = -1
+        if closed != 0 or p[0] > real(0.0):
+            bristle = vec3(real(0.0), p[1] * rate + b_t * u[1], p[2] * rate + b_t * u[2])
+            slots.last_feature[env, slot] = slots.feature[env, slot]
+            slots.last_impulse[env, slot] = p[0]
+            slots.last_bristle[env, slot] = wp.transpose(frame) * bristle
 
     return SimpleNamespace(judge=judge, remember=remember)
 
@@ -193,13 +198,17 @@ def make(real):
                     status[env] = status[env] | NOT_A_NUMBER
 
             if solved or final != 0:
-                for slot in range(slots.last_feature.shape[1]):
-                    slots.last_feature[env, slot] = -1
                 for i in range(r):
-                    p = contacts.impulse[env, i]
-                    # An unloaded contact is remembered as such; one that never closed will be new when it does.
-                    if p[0] > real(0.0) or contacts.closed[env, i] != 0:
-                        frame = contacts.frame[env, i]
-                        remember(slots, env, contacts.slot[env, i], rate, frame, p, contacts.velocity[env, i], contacts.damping[env, i])
+                    remember(
+                        slots,
+                        env,
+                        contacts.slot[env, i],
+                        contacts.closed[env, i],
+                        rate,
+                        contacts.frame[env, i],
+                        contacts.impulse[env, i],
+                        contacts.velocity[env, i],
+                        contacts.damping[env, i],
+                    )
 
     return certify

@@ -353,7 +353,7 @@ def make(real) -> SimpleNamespace:
         status: wp.array(dtype=int),
         stride: int,
     ):
-        """The slots whose gap could close within the step, in order, and the relative velocities there."""
+        """The slots whose gap could close within the step, in order, and the relative velocities there; others have no history."""
         start, _ = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
             fall = h * h * wp.length(parameters.gravity[env % parameters.gravity.shape[0]]) + real(1.0e-9)
@@ -361,6 +361,7 @@ def make(real) -> SimpleNamespace:
             count = int(0)
             for slot in range(slots.gap.shape[1]):
                 phi = slots.gap[env, slot]
+                selected = bool(False)
                 if phi < real(NO_POINT):
                     u, u_free = velocities(topology, bodies, env, topology.slot_pair[slot], slots.point[env, slot])
                     # Twice the speed counts, not its approaching part: an impact elsewhere on the body turns one into the
@@ -372,8 +373,11 @@ def make(real) -> SimpleNamespace:
                             contacts.velocity[env, count] = u
                             contacts.free[env, count] = u_free
                             count += 1
+                            selected = True
                         else:
                             status[env] = status[env] | OVERFLOW
+                if not selected:
+                    slots.last_feature[env, slot] = -1
             contacts.count[env] = count
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)

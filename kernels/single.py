@@ -215,8 +215,6 @@ def make(real, cone: bool, frozen: bool, rows: bool):
             change = response(inv_mass, inv_inertia, total)
             dv = wp.spatial_top(change)
             dw = wp.spatial_bottom(change)
-            for slot in range(slots.last_feature.shape[1]):
-                slots.last_feature[env, slot] = -1
             worst = real(0.0)
             energy = real(0.0)
             finite = wp.isfinite(change) and wp.isfinite(com)
@@ -245,8 +243,7 @@ def make(real, cone: bool, frozen: bool, rows: bool):
                 energy += part
                 contacts.velocity[env, i] = ended
                 contacts.state[env, i] = state
-                if p[0] > real(0.0) or contacts.closed[env, i] != 0:
-                    remember(slots, env, contacts.slot[env, i], rate, frame, p, ended, contacts.damping[env, i])
+                remember(slots, env, contacts.slot[env, i], contacts.closed[env, i], rate, frame, p, ended, contacts.damping[env, i])
             for b in range(next_velocity.shape[1]):
                 next_velocity[env, b] = bodies.free_velocity[env, b]
                 finite = finite and wp.isfinite(next_velocity[env, b])
