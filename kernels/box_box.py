@@ -78,24 +78,33 @@ def polygon(real) -> SimpleNamespace:
         edge: vec8i  # which line leads from this vertex to the next: 0-3 incident face, 4-7 clipping planes
 
     @wp.func
-    def clip(p: Polygon, plane: int, half: real):
-        """Keep the part within one side of the reference face; plane = 0..3 for x <= half, -x <= half, y.., -y.."""
-        result = Polygon()
-        count = int(0)
-        sign = real(1.0)
+    def beyond(p: Polygon, k: int, plane: int, half: real) -> real:
+        """How far vertex k lies beyond a side of the reference face; plane = 0..3 for x <= half, -x <= half, y.., -y.."""
+        along = p.x[k]
+        if plane >= 2:
+            along = p.y[k]
         if plane % 2 == 1:
-            sign = real(-1.0)
+            along = -along
+        return along - half
+
+    @wp.func
+    def clip(p: Polygon, plane: int, half: real):
+        """Keep the part within one side of the reference face."""
         # A corner that lies on the side keeps its identity, whatever the last bits say.
         slack = half * real(1.0e-4)
+        most = real(0.0)
+        for k in range(p.count):
+            most = wp.max(most, beyond(p, k, plane, half))
+        if most <= slack:
+            return p
+        result = Polygon()
+        count = int(0)
         for k in range(p.count):
             m = k + 1
             if m == p.count:
                 m = 0
-            here = sign * p.x[k] - half
-            there = sign * p.x[m] - half
-            if plane >= 2:
-                here = sign * p.y[k] - half
-                there = sign * p.y[m] - half
+            here = beyond(p, k, plane, half)
+            there = beyond(p, m, plane, half)
             keep_here = here <= slack
             keep_there = there <= slack
             if keep_here and count < 8:
