@@ -129,8 +129,11 @@ def make(real, cone: bool, frozen: bool, rows: bool):
                     row.inv_mass = vec3(w_nn, w_1, w_2)
                     write_row(contacts, env, i, pair_body, point, slots.gap[env, slot], row)
 
-            mass = wp.diag(vec3(real(1.0) / inv_mass))
-            inertia = wp.inverse(inv_inertia)
+            mass = mat33()
+            inertia = mat33()
+            if count > 0:
+                mass = wp.diag(vec3(real(1.0) / inv_mass))
+                inertia = wp.inverse(inv_inertia)
             total = spatial()
             flips = count
             solves = int(0)
