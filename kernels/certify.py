@@ -34,13 +34,13 @@ def functions(real) -> SimpleNamespace:
 
     @wp.func
     def contact_state(p: vec3, mu: vec2, bound: vec2, k: int) -> int:
-        """Open, stick or slide: it slides where a slightly larger friction impulse would not be admissible."""
+        """Open, stick or slide: it slides where a slightly larger friction impulse would not be admissible, or none ever is."""
         state = OPEN
         if p[0] > real(0.0):
             state = STICK
             pressed = vec2(p[1], p[2]) * (real(1.0) + real(1.0e-6))  # not real(1.0 + ...): literals add up in single precision
             inside = project_friction(pressed, mu * p[0] + bound, k) - pressed
-            if k != 0 and wp.dot(inside, inside) > real(0.0):
+            if k == 0 or wp.dot(inside, inside) > real(0.0):
                 state = SLIDE
         return state
 

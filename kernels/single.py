@@ -11,7 +11,7 @@ import functools
 import warp as wp
 
 from . import certify, contacts, pivoting, rigid
-from .types import CLOSED, OPTIONS, scalar_types
+from .types import CLOSED, ITERATION_LIMIT, OPTIONS, scalar_types
 
 
 @functools.cache
@@ -101,6 +101,7 @@ def make(real, cone: bool, frozen: bool, rows: bool):
         residual: wp.array(dtype=real),
         residual_energy: wp.array(dtype=real),
         iterations: wp.array(dtype=int),
+        reason: wp.array(dtype=int),
         stride: int,
     ):
         """The environments todo[:number] by pivoting; those without a certificate go to `left`."""
@@ -213,6 +214,8 @@ def make(real, cone: bool, frozen: bool, rows: bool):
                         if wp.static(cone):
                             contacts.slip[env, i] = turned
             iterations[env] = iterations[env] + solves
+            if flips > 0:
+                reason[env] = reason[env] | ITERATION_LIMIT
 
             # The certificate, from the impulses alone: what their wrench changes, not what the system above says.
             change = response(inv_mass, inv_inertia, total)

@@ -12,6 +12,8 @@ from conftest import GRAVITY as G
 import warp_lcp as wl
 from warp_lcp import methods
 
+METHOD_NAMES = {"VelocityPivoting": "velocity_pivoting", "ProximalNewton": "proximal_newton", "BlockPGS": "pgs"}
+
 
 def bits(sim: wl.Simulator) -> np.ndarray:
     """State of every environment as integers, so that equality means equal bits."""
@@ -106,13 +108,13 @@ def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
         assert (bits(sim) == same).all()
 
 
-@pytest.mark.parametrize("name", ["ProximalNewton", "BlockPGS"])
+@pytest.mark.parametrize("name", ["VelocityPivoting", "ProximalNewton", "BlockPGS"])
 def test_a_method_that_is_stopped_says_so(monkeypatch, name):
     """Alone and without a single sweep or step: not certified, and the limit is named as what stopped it."""
     method = getattr(methods, name)
-    monkeypatch.setattr(method, "SWEEPS", 0)
+    monkeypatch.setattr(method, "SWEEPS", 0, raising=False)
     monkeypatch.setattr(method, "LIMIT", 0, raising=False)
-    sim = simulator(paper_box(), method={"ProximalNewton": "proximal_newton", "BlockPGS": "pgs"}[name])
+    sim = simulator(paper_box(), method=METHOD_NAMES[name])
     sim.step()
     assert sim.status.numpy()[0] == wl.Status.ITERATION_LIMIT | wl.Status.UNCERTIFIED
     assert sim.residual.numpy()[0] == pytest.approx(G * 1e-3)  # no impulse at all

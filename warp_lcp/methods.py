@@ -213,7 +213,7 @@ class VelocityPivoting(Method):
         if self.parts is None:
             scene = [sim.topology, sim.parameters, sim.bodies, sim.slots, sim.rows, int(self.movable[0])]
             lists = [todo, number, sim.doubtful, sim.num_doubtful, sim.unsolved]
-            answer = [sim.residual, sim.residual_energy, sim.iterations]
+            answer = [sim.residual, sim.residual_energy, sim.iterations, sim.reason]
             limits = [self.LIMIT, sim.sign_tolerance, sim.tolerance]
             sim.launch(self.kernel, [*scene, sim.dt, *sim.law.row_arguments, *limits, sim.next_velocity, *lists, *answer])
         else:
