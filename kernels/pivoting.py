@@ -32,7 +32,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import sparse
+from . import friction, sparse
 from .types import BLOCK_OPTIONS, OPTIONS, scalar_types, sync
 
 # State of a contact while it is solved: bit 0 closed, bits 1-2 axis t1, bits 3-4 axis t2.
@@ -42,6 +42,19 @@ AXIS_SLIDES_UP = 1  # along +t: the impulse is -mu p_n
 AXIS_SLIDES_DOWN = 2
 # Friction on the cone is linearised again while it misses its direction by more than this [m/s].
 CONE_TOLERANCE = wp.constant(1.0e-9)
+# Newton's method: softness of the first problem, what it is multiplied by, the least, and the steps spent on a soft one.
+SOFTEST = 1.0e-1
+HARDER_FIRST = 1.0e-2
+HARDER = 1.0e-1
+ATTEMPTS = 2
+HARDEST = 0.9e-5
+SOFT_STEPS = 8
+# Done where no impulse is further from what was expected [m/s]; while soft, a part of the largest velocity.
+MISS = 1.0e-9
+SOFT_MISS = 1.0e-2
+# The line search ends where dx . R has fallen to this part, or after so many looks.
+LINE_ACCURACY = 0.1
+MOST_LOOKS = 24
 
 
 @functools.cache
@@ -401,6 +414,8 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
     Bodies, Contacts = t.Bodies, t.Contacts
     f = functions(real, cone, frozen)
     operator, update = f.operator, f.update
+    law = friction.functions(real)
+    admissible, slope, weigh = law.admissible, law.slope, law.weigh
     s = sparse.functions(real, 6)
     Graph, clear, connect, analyse, clear_factors = s.Graph, s.clear, s.connect, s.analyse, s.clear_factors
     factorise, solve = s.factorise, s.solve
@@ -415,9 +430,15 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         contact: wp.array2d(dtype=int)  # [P, 2 R]
         matrix: wp.array2d(dtype=mat33)  # [P, R] K
         shift: wp.array2d(dtype=vec3)  # [P, R] g
-        change: wp.array2d(dtype=vec6)  # [P, n] x
+        change: wp.array2d(dtype=vec6)  # [P, n] what x becomes; while Newton's method runs dx
         scratch: wp.array2d(dtype=vec6)  # [P, n]
         flips: wp.array(dtype=int)  # [P]
+        # Of Newton's method with a line search:
+        present: wp.array2d(dtype=vec6)  # [P, n] x where the step starts
+        relaxed: wp.array2d(dtype=vec3)  # [P, R] f + J x there
+        ahead: wp.array2d(dtype=vec3)  # [P, R] J dx
+        expected: wp.array2d(dtype=vec3)  # [P, R] impulse after the step, if no contact changes state
+        part: wp.array2d(dtype=vec3)  # [P, R] what a contact adds to the numbers of the line search
 
     @wp.func
     def node(number: wp.array(dtype=int), body: int) -> int:
@@ -509,8 +530,9 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         vw = mat33()
         wv = mat33()
         ww = wp.inverse(inv_inertia[env, index])
-        bv = vec3()
-        bw = vec3()
+        x = ws.present[slot, b]
+        bv = -(vv * vec3(x[0], x[1], x[2]))
+        bw = -(ww * vec3(x[3], x[4], x[5]))
         for e in range(ws.begin[slot, b], ws.begin[slot, b + 1]):
             i = ws.contact[slot, e]
             pair = body[env, i]
@@ -547,6 +569,125 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
             u = vec3(x[0], x[1], x[2]) + wp.cross(vec3(x[3], x[4], x[5]), point - com[env, body])
         return u
 
+    @wp.func
+    def softened(eps: vec3, inv_mass: vec3, k: int, softness: real) -> vec3:
+        return eps + softness * weigh(inv_mass, k)
+
+    @wp.func
+    def tangent(frame: mat33, relaxed: vec3, eps: vec3, mu: vec2, bound: vec2, k: int, follows: real):
+        """The impulse p = pi(-relaxed / eps) linearised: p - K J dx; K [kg] and -p [N s] in world axes.
+
+        follows = 0 leaves out that friction grows with the normal impulse, which makes K symmetric.
+        """
+        x = -wp.cw_div(relaxed, eps)
+        d = slope(x, mu, bound, k)
+        d[1, 0] = follows * d[1, 0]
+        d[2, 0] = follows * d[2, 0]
+        d = d * wp.diag(vec3(real(1.0) / eps[0], real(1.0) / eps[1], real(1.0) / eps[2]))
+        back = wp.transpose(frame)
+        return back * d * frame, -(back * admissible(x, mu, bound, k))
+
+    @wp.func
+    def begin_search(
+        ws: Workspace,
+        com: wp.array2d(dtype=vec3),
+        inv_mass: wp.array2d(dtype=real),
+        inv_inertia: wp.array2d(dtype=mat33),
+        contacts: Contacts,
+        env: int,
+        slot: int,
+        r: int,
+        lane: int,
+    ):
+        """J dx, the impulses expected at x + dx, and dx . M x, dx . M dx of each body in scratch."""
+        for i in range(lane, r, wp.block_dim()):
+            body = contacts.body[env, i]
+            point = contacts.point[env, i]
+            frame = contacts.frame[env, i]
+            du = body_change(ws, com, env, slot, body[1], point) - body_change(ws, com, env, slot, body[0], point)
+            ws.ahead[slot, i] = frame * du
+            ws.expected[slot, i] = -(frame * (ws.matrix[slot, i] * du + ws.shift[slot, i]))
+        for b in range(lane, ws.body.shape[0], wp.block_dim()):
+            index = ws.body[b]
+            x = ws.present[slot, b]
+            d = ws.change[slot, b]
+            dv = vec3(d[0], d[1], d[2]) / inv_mass[env, index]
+            dw = wp.inverse(inv_inertia[env, index]) * vec3(d[3], d[4], d[5])
+            momentum = vec6(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
+            ws.scratch[slot, b] = vec6(wp.dot(momentum, x), wp.dot(momentum, d), real(0.0), real(0.0), real(0.0), real(0.0))
+        sync()
+
+    @wp.func
+    def look(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, softness: real, length: real, lane: int) -> vec3:
+        """At x + length dx: dx . R [J], its derivative by length, and how far the impulses are from those expected [m/s].
+
+        R = M x - J^T p(x) is what is left of the momentum's balance.
+        """
+        for i in range(lane, r, wp.block_dim()):
+            k = contacts.directions[env, i]
+            mu = contacts.mu[env, i]
+            bound = contacts.bound[env, i]
+            w = weigh(contacts.inv_mass[env, i], k)
+            eps = softened(contacts.relaxation[env, i], contacts.inv_mass[env, i], k, softness)
+            ahead = ws.ahead[slot, i]
+            x = -wp.cw_div(ws.relaxed[slot, i] + length * ahead, eps)
+            p = admissible(x, mu, bound, k)
+            contacts.impulse[env, i] = p
+            stiff = wp.dot(ahead, slope(x, mu, bound, k) * wp.cw_div(ahead, eps))
+            ws.part[slot, i] = vec3(wp.dot(ahead, p), stiff, wp.max(wp.cw_mul(w, wp.abs(p - ws.expected[slot, i]))))
+        sync()
+        force = real(0.0)
+        rate = real(0.0)
+        miss = real(0.0)
+        for b in range(ws.body.shape[0]):
+            moved = ws.scratch[slot, b]
+            force += moved[0] + length * moved[1]
+            rate += moved[1]
+        for i in range(r):
+            part = ws.part[slot, i]
+            force -= part[0]
+            rate += part[1]
+            miss = wp.max(miss, part[2])
+        sync()
+        return vec3(force, rate, miss)
+
+    @wp.func
+    def step_length(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, softness: real, lane: int):
+        """The part of the step after which dx . R is next to nothing, dx . R before and after it, and how far the impulses after
+        the whole step are from those expected [m/s]."""
+        length = real(0.0)
+        start = real(0.0)
+        after = real(0.0)
+        miss = real(0.0)
+        low = real(0.0)
+        high = real(1.0)
+        looks = int(0)
+        looking = bool(True)
+        while looking:
+            found = look(ws, contacts, env, slot, r, softness, length, lane)
+            after = found[0]
+            if looks == 0:
+                start = after
+                length = real(1.0)
+            else:
+                if looks == 1:
+                    miss = found[2]
+                if after > real(0.0):
+                    high = length
+                else:
+                    low = length
+                small = wp.abs(after) <= real(LINE_ACCURACY) * wp.abs(start)
+                if start >= real(0.0) or small or low == real(1.0) or looks == MOST_LOOKS:
+                    looking = False
+                else:
+                    length = length - after / found[1]
+                    if not (length > low and length < high):
+                        length = wp.max(real(0.5) * (low + high), real(0.0))
+                        if low == real(0.0):
+                            length = real(0.1) * high
+            looks += 1
+        return length, start, after, miss
+
     @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def pivot(
         bodies: Bodies,
@@ -555,7 +696,8 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         number: wp.array(dtype=int),
         g: Graph,
         ws: Workspace,
-        limit: int,
+        flip_limit: int,
+        newton_limit: int,
         tolerance: real,
         iterations: wp.array(dtype=int),
     ):
@@ -564,31 +706,55 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         for index in range(slot, number[0], ws.flips.shape[0]):
             env = todo[index]
             r = contacts.count[env]
-            flips = r
             solves = int(0)
-            if r > 0:
+            searching = r > 0
+            if searching:
                 list_contacts(ws, contacts.body, env, slot, r, lane)
-                if not couple(g, ws, contacts.body, env, slot, lane):
-                    flips = 0
-            while flips > 0 and solves < limit:
+                searching = couple(g, ws, contacts.body, env, slot, lane)
+            for b in range(lane, n, wp.block_dim()):
+                ws.present[slot, b] = vec6()
+            attempt = int(0)  # flips, then Newton's method with a line search
+            limit = int(flip_limit)
+            softness = real(0.0)
+            harder = real(0.0)
+            follows = real(1.0)
+            size = real(0.0)
+            inner = int(0)
+            while searching:
+                # Each function is called in one place: Warp's compilers inline them all.
                 clear_factors(g, slot, n, lane)
                 for i in range(lane, r, wp.block_dim()):
                     bound = vec2()
                     if wp.static(frozen):
                         bound = contacts.bound[env, i]
-                    slip = vec3()
-                    if wp.static(cone):
-                        slip = contacts.slip[env, i]
-                    matrix, shift = operator(
-                        contacts.frame[env, i],
-                        contacts.relaxation[env, i],
-                        contacts.free[env, i],
-                        contacts.mu[env, i],
-                        bound,
-                        contacts.directions[env, i],
-                        contacts.state[env, i],
-                        slip,
-                    )
+                    matrix = mat33()
+                    shift = vec3()
+                    if attempt == 0:
+                        slip = vec3()
+                        if wp.static(cone):
+                            slip = contacts.slip[env, i]
+                        matrix, shift = operator(
+                            contacts.frame[env, i],
+                            contacts.relaxation[env, i],
+                            contacts.free[env, i],
+                            contacts.mu[env, i],
+                            bound,
+                            contacts.directions[env, i],
+                            contacts.state[env, i],
+                            slip,
+                        )
+                    else:
+                        k = contacts.directions[env, i]
+                        eps = softened(contacts.relaxation[env, i], contacts.inv_mass[env, i], k, softness)
+                        matrix, shift = tangent(
+                            contacts.frame[env, i],
+                            ws.relaxed[slot, i],
+                            eps,
+                            contacts.mu[env, i],
+                            bound,
+                            k,
+                            follows,
+                        )
                     ws.matrix[slot, i] = matrix
                     ws.shift[slot, i] = shift
                 if lane == 0:
@@ -599,37 +765,82 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
                 sync()
                 factorise(g, slot, n, lane)
                 solve(g, slot, n, ws.change, ws.scratch, lane)
-                for i in range(lane, r, wp.block_dim()):
-                    body = contacts.body[env, i]
-                    point = contacts.point[env, i]
-                    du = body_change(ws, bodies.com, env, slot, body[1], point) - body_change(ws, bodies.com, env, slot, body[0], point)
-                    bound = vec2()
-                    if wp.static(frozen):
-                        bound = contacts.bound[env, i]
-                    slip = vec3()
-                    if wp.static(cone):
-                        slip = contacts.slip[env, i]
-                    p, after, turned, again = update(
-                        contacts.free[env, i] + contacts.frame[env, i] * du,
-                        contacts.relaxation[env, i],
-                        contacts.inv_mass[env, i],
-                        contacts.mu[env, i],
-                        bound,
-                        contacts.directions[env, i],
-                        contacts.state[env, i],
-                        slip,
-                        tolerance,
-                    )
-                    contacts.impulse[env, i] = p
-                    if again:
-                        wp.atomic_add(ws.flips, slot, 1)
-                        contacts.state[env, i] = after
-                        if wp.static(cone):
-                            contacts.slip[env, i] = turned
-                sync()
-                flips = ws.flips[slot]
                 solves += 1
-                sync()
+                if attempt == 0:
+                    for i in range(lane, r, wp.block_dim()):
+                        body = contacts.body[env, i]
+                        point = contacts.point[env, i]
+                        du = body_change(ws, bodies.com, env, slot, body[1], point) - body_change(ws, bodies.com, env, slot, body[0], point)
+                        bound = vec2()
+                        if wp.static(frozen):
+                            bound = contacts.bound[env, i]
+                        slip = vec3()
+                        if wp.static(cone):
+                            slip = contacts.slip[env, i]
+                        p, after, turned, again = update(
+                            contacts.free[env, i] + contacts.frame[env, i] * du,
+                            contacts.relaxation[env, i],
+                            contacts.inv_mass[env, i],
+                            contacts.mu[env, i],
+                            bound,
+                            contacts.directions[env, i],
+                            contacts.state[env, i],
+                            slip,
+                            tolerance,
+                        )
+                        contacts.impulse[env, i] = p
+                        if again:
+                            wp.atomic_add(ws.flips, slot, 1)
+                            contacts.state[env, i] = after
+                            if wp.static(cone):
+                                contacts.slip[env, i] = turned
+                    sync()
+                    searching = ws.flips[slot] > 0
+                    sync()
+                else:
+                    begin_search(ws, bodies.com, bodies.inv_mass, bodies.inv_inertia, contacts, env, slot, r, lane)
+                    length, first, last, miss = step_length(ws, contacts, env, slot, r, softness, lane)
+                    inner += 1
+                    done = miss <= real(MISS)
+                    if softness > real(0.0):
+                        done = miss <= real(SOFT_MISS) * size
+                    uphill = first >= real(0.0) and (attempt > 1 or wp.abs(last) >= first)
+                    if uphill and not done and follows > real(0.0):
+                        follows = real(0.0)  # once more from here
+                    else:
+                        follows = real(1.0)
+                        if done:
+                            length = real(1.0)
+                        for i in range(lane, r, wp.block_dim()):
+                            ws.relaxed[slot, i] = ws.relaxed[slot, i] + length * ws.ahead[slot, i]
+                        for b in range(lane, n, wp.block_dim()):
+                            ws.present[slot, b] = ws.present[slot, b] + length * ws.change[slot, b]
+                        sync()
+                    searching = not done or softness > real(0.0)
+                    if softness > real(0.0) and (done or inner >= SOFT_STEPS):
+                        inner = 0
+                        softness = harder * softness
+                        if softness < real(HARDEST):
+                            softness = real(0.0)
+                if searching and solves >= limit:
+                    # Again, from no impulse at all and with soft contacts.
+                    attempt += 1
+                    searching = attempt <= ATTEMPTS
+                    limit += attempt * newton_limit
+                    softness = real(SOFTEST)
+                    harder = real(HARDER)
+                    if attempt == 1:
+                        harder = real(HARDER_FIRST)
+                    follows = real(1.0)
+                    inner = 0
+                    size = real(0.0)
+                    for i in range(r):
+                        size = wp.max(size, wp.max(wp.abs(contacts.free[env, i])))
+                    for i in range(lane, r, wp.block_dim()):
+                        ws.relaxed[slot, i] = contacts.free[env, i]
+                    for b in range(lane, n, wp.block_dim()):
+                        ws.present[slot, b] = vec6()
+                    sync()
             if lane == 0:
                 iterations[env] = iterations[env] + solves
             sync()

@@ -139,6 +139,7 @@ class VelocityPivoting:
     """Principal pivoting on contact states in the velocities, for laws with two friction axes or a disc."""
 
     LIMIT = 12
+    NEWTON_LIMIT = 50
     #: Room for neighbours and for blocks of a triangular factor, per body.
     NEIGHBOURS, FILL = 32, 64
 
@@ -154,7 +155,7 @@ class VelocityPivoting:
             return
         n, contacts = len(self.movable), sim.model.max_contacts
         blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
-        self.slots = workspaces(sim.num_envs, 72 * (n + fill) + 14 * contacts, sim.device)
+        self.slots = workspaces(sim.num_envs, 72 * (n + fill) + 24 * contacts, sim.device)
         self.graph = graph_workspace(sim.real, 6, self.slots, n, blocks, fill, sim.device)
         ws = self.workspace = self.parts.Workspace()
         number = np.full(sim.model.num_bodies, -1, dtype=np.int32)
@@ -169,16 +170,21 @@ class VelocityPivoting:
             ("shift", contacts, t.vec3),
             ("change", n, vec6),
             ("scratch", n, vec6),
+            ("present", n, vec6),
+            ("relaxed", contacts, t.vec3),
+            ("ahead", contacts, t.vec3),
+            ("expected", contacts, t.vec3),
+            ("part", contacts, t.vec3),
         ):
             setattr(ws, name, wp.empty((self.slots, max(width, 1)), dtype=dtype, device=sim.device))
         ws.flips = wp.zeros(self.slots, dtype=int, device=sim.device)
 
     def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
-        tail = [self.LIMIT, sim.sign_tolerance, sim.iterations]
+        tail = [sim.sign_tolerance, sim.iterations]
         if self.single:
-            sim.launch(self.kernel, [sim.bodies, int(self.movable[0]), sim.rows, todo, number, *tail])
+            sim.launch(self.kernel, [sim.bodies, int(self.movable[0]), sim.rows, todo, number, self.LIMIT, *tail])
         else:
-            inputs = [sim.bodies, sim.rows, todo, number, self.graph, self.workspace, *tail]
+            inputs = [sim.bodies, sim.rows, todo, number, self.graph, self.workspace, self.LIMIT, self.NEWTON_LIMIT, *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
