@@ -436,6 +436,7 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         # Of Newton's method with a line search:
         present: wp.array2d(dtype=vec6)  # [P, n] x where the step starts
         relaxed: wp.array2d(dtype=vec3)  # [P, R] f + J x there
+        stiffness: wp.array2d(dtype=vec3)  # [P, R] 1 / eps
         ahead: wp.array2d(dtype=vec3)  # [P, R] J dx
         expected: wp.array2d(dtype=vec3)  # [P, R] impulse after the step, if no contact changes state
         part: wp.array2d(dtype=vec3)  # [P, R] what a contact adds to the numbers of the line search
@@ -570,22 +571,17 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         return u
 
     @wp.func
-    def softened(eps: vec3, inv_mass: vec3, k: int, softness: real) -> vec3:
-        return eps + softness * weigh(inv_mass, k)
-
-    @wp.func
-    def tangent(frame: mat33, relaxed: vec3, eps: vec3, mu: vec2, bound: vec2, k: int, follows: real):
-        """The impulse p = pi(-relaxed / eps) linearised: p - K J dx; K [kg] and -p [N s] in world axes.
+    def tangent(frame: mat33, relaxed: vec3, stiffness: vec3, mu: vec2, bound: vec2, k: int, follows: real):
+        """The impulse p = pi(-relaxed / eps) linearised: p - K J dx; K [kg] and -p [N s] in world axes, stiffness = 1 / eps.
 
         follows = 0 leaves out that friction grows with the normal impulse, which makes K symmetric.
         """
-        x = -wp.cw_div(relaxed, eps)
+        x = -wp.cw_mul(relaxed, stiffness)
         d = slope(x, mu, bound, k)
         d[1, 0] = follows * d[1, 0]
         d[2, 0] = follows * d[2, 0]
-        d = d * wp.diag(vec3(real(1.0) / eps[0], real(1.0) / eps[1], real(1.0) / eps[2]))
         back = wp.transpose(frame)
-        return back * d * frame, -(back * admissible(x, mu, bound, k))
+        return back * (d * wp.diag(stiffness)) * frame, -(back * admissible(x, mu, bound, k))
 
     @wp.func
     def begin_search(
@@ -599,14 +595,16 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         r: int,
         lane: int,
     ):
-        """J dx, the impulses expected at x + dx, and dx . M x, dx . M dx of each body in scratch."""
+        """J dx, the impulses expected at x + dx, J dx . p(x), and in scratch dx . M x and dx . M dx of each body."""
         for i in range(lane, r, wp.block_dim()):
             body = contacts.body[env, i]
             point = contacts.point[env, i]
             frame = contacts.frame[env, i]
             du = body_change(ws, com, env, slot, body[1], point) - body_change(ws, com, env, slot, body[0], point)
             ws.ahead[slot, i] = frame * du
-            ws.expected[slot, i] = -(frame * (ws.matrix[slot, i] * du + ws.shift[slot, i]))
+            shift = ws.shift[slot, i]
+            ws.expected[slot, i] = -(frame * (ws.matrix[slot, i] * du + shift))
+            ws.part[slot, i] = vec3(-wp.dot(du, shift), real(0.0), real(0.0))
         for b in range(lane, ws.body.shape[0], wp.block_dim()):
             index = ws.body[b]
             x = ws.present[slot, b]
@@ -618,74 +616,74 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         sync()
 
     @wp.func
-    def look(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, softness: real, length: real, lane: int) -> vec3:
-        """At x + length dx: dx . R [J], its derivative by length, and how far the impulses are from those expected [m/s].
-
-        R = M x - J^T p(x) is what is left of the momentum's balance.
-        """
+    def look(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, length: real, lane: int):
+        """Impulses at x + length dx, and what contacts add to dx . R there, to its derivative and to the miss (`step_length`)."""
         for i in range(lane, r, wp.block_dim()):
             k = contacts.directions[env, i]
             mu = contacts.mu[env, i]
             bound = contacts.bound[env, i]
-            w = weigh(contacts.inv_mass[env, i], k)
-            eps = softened(contacts.relaxation[env, i], contacts.inv_mass[env, i], k, softness)
+            stiffness = ws.stiffness[slot, i]
             ahead = ws.ahead[slot, i]
-            x = -wp.cw_div(ws.relaxed[slot, i] + length * ahead, eps)
+            x = -wp.cw_mul(ws.relaxed[slot, i] + length * ahead, stiffness)
             p = admissible(x, mu, bound, k)
             contacts.impulse[env, i] = p
-            stiff = wp.dot(ahead, slope(x, mu, bound, k) * wp.cw_div(ahead, eps))
-            ws.part[slot, i] = vec3(wp.dot(ahead, p), stiff, wp.max(wp.cw_mul(w, wp.abs(p - ws.expected[slot, i]))))
+            part = vec3(wp.dot(ahead, p), wp.dot(ahead, slope(x, mu, bound, k) * wp.cw_mul(ahead, stiffness)), real(0.0))
+            if length == real(1.0):
+                part[2] = wp.max(wp.cw_mul(weigh(contacts.inv_mass[env, i], k), wp.abs(p - ws.expected[slot, i])))
+            ws.part[slot, i] = part
         sync()
-        force = real(0.0)
-        rate = real(0.0)
-        miss = real(0.0)
-        for b in range(ws.body.shape[0]):
-            moved = ws.scratch[slot, b]
-            force += moved[0] + length * moved[1]
-            rate += moved[1]
-        for i in range(r):
-            part = ws.part[slot, i]
-            force -= part[0]
-            rate += part[1]
-            miss = wp.max(miss, part[2])
-        sync()
-        return vec3(force, rate, miss)
 
     @wp.func
-    def step_length(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, softness: real, lane: int):
-        """The part of the step after which dx . R is next to nothing, dx . R before and after it, and how far the impulses after
-        the whole step are from those expected [m/s]."""
-        length = real(0.0)
+    def step_length(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, lane: int):
+        """The part of the step after which dx . R is next to nothing, dx . R [J] before and after it, and how far the impulses
+        after the whole step are from those expected (the miss) [m/s].
+
+        R = M x - J^T p(x) is what is left of the momentum's balance. Where friction does not matter R is the gradient of a
+        convex function, and this its least value along dx.
+        """
         start = real(0.0)
-        after = real(0.0)
-        miss = real(0.0)
+        mass = real(0.0)
+        for b in range(ws.body.shape[0]):
+            moved = ws.scratch[slot, b]
+            start += moved[0]
+            mass += moved[1]
+        balance = start
+        for i in range(r):
+            start -= ws.part[slot, i][0]
+        sync()
+        length = real(1.0)
         low = real(0.0)
         high = real(1.0)
+        after = real(0.0)
+        miss = real(0.0)
         looks = int(0)
         looking = bool(True)
         while looking:
-            found = look(ws, contacts, env, slot, r, softness, length, lane)
-            after = found[0]
-            if looks == 0:
-                start = after
-                length = real(1.0)
-            else:
-                if looks == 1:
-                    miss = found[2]
-                if after > real(0.0):
-                    high = length
-                else:
-                    low = length
-                small = wp.abs(after) <= real(LINE_ACCURACY) * wp.abs(start)
-                if start >= real(0.0) or small or low == real(1.0) or looks == MOST_LOOKS:
-                    looking = False
-                else:
-                    length = length - after / found[1]
-                    if not (length > low and length < high):
-                        length = wp.max(real(0.5) * (low + high), real(0.0))
-                        if low == real(0.0):
-                            length = real(0.1) * high
+            look(ws, contacts, env, slot, r, length, lane)
+            after = balance + length * mass
+            rate = mass
+            for i in range(r):
+                part = ws.part[slot, i]
+                after -= part[0]
+                rate += part[1]
+                if looks == 0:
+                    miss = wp.max(miss, part[2])
+            sync()
             looks += 1
+            if after > real(0.0):
+                high = length
+            else:
+                low = length
+            small = wp.abs(after) <= real(LINE_ACCURACY) * wp.abs(start)
+            if start >= real(0.0) or small or low == real(1.0) or looks == MOST_LOOKS:
+                looking = False
+            else:
+                length -= after / rate
+                if not (length > low and length < high):
+                    # Contacts may differ in stiffness by a factor of 1e7.
+                    length = real(0.5) * (low + high)
+                    if low == real(0.0):
+                        length = real(0.1) * high
         return length, start, after, miss
 
     @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
@@ -745,15 +743,11 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
                         )
                     else:
                         k = contacts.directions[env, i]
-                        eps = softened(contacts.relaxation[env, i], contacts.inv_mass[env, i], k, softness)
+                        eps = contacts.relaxation[env, i] + softness * weigh(contacts.inv_mass[env, i], k)
+                        stiffness = wp.cw_div(vec3(real(1.0)), eps)
+                        ws.stiffness[slot, i] = stiffness
                         matrix, shift = tangent(
-                            contacts.frame[env, i],
-                            ws.relaxed[slot, i],
-                            eps,
-                            contacts.mu[env, i],
-                            bound,
-                            k,
-                            follows,
+                            contacts.frame[env, i], ws.relaxed[slot, i], stiffness, contacts.mu[env, i], bound, k, follows
                         )
                     ws.matrix[slot, i] = matrix
                     ws.shift[slot, i] = shift
@@ -799,7 +793,7 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
                     sync()
                 else:
                     begin_search(ws, bodies.com, bodies.inv_mass, bodies.inv_inertia, contacts, env, slot, r, lane)
-                    length, first, last, miss = step_length(ws, contacts, env, slot, r, softness, lane)
+                    length, first, last, miss = step_length(ws, contacts, env, slot, r, lane)
                     inner += 1
                     done = miss <= real(MISS)
                     if softness > real(0.0):

@@ -27,6 +27,7 @@ WORD = 32
 def functions(real, size: int) -> SimpleNamespace:
     """Bundle ``Graph`` of blocks size x size and the functions that work on it."""
     t = scalar_types(real)
+    last = size - 1
     vector = t.vec3 if size == 3 else wp.types.vector(length=size, dtype=real)
     matrix = t.mat33 if size == 3 else wp.types.matrix(shape=(size, size), dtype=real)
 
@@ -226,16 +227,24 @@ def functions(real, size: int) -> SimpleNamespace:
                             b[i, j] = b[i, j] - f * b[k, j]
         return b
 
+    # Loops below end at the variable of a loop around them: only such ranges are known to Warp, which unrolls them.
+
     @wp.func
     def lower_upper(a: matrix) -> matrix:
-        """L and U of a block in one matrix: L below the diagonal, U above, 1 / U_kk on it."""
+        """L and U of a block in one matrix: L below the diagonal, U above, 1 / U_kk on it; row and column k at a time."""
         for k in range(size):
-            a[k, k] = real(1.0) / a[k, k]
-            for i in range(k + 1, size):
-                f = a[i, k] * a[k, k]
-                a[i, k] = f
-                for j in range(k + 1, size):
-                    a[i, j] = a[i, j] - f * a[k, j]
+            for i in range(k):
+                left = a[k, i]
+                up = a[i, k]
+                for j in range(i):
+                    left -= a[k, j] * a[j, i]
+                    up -= a[i, j] * a[j, k]
+                a[k, i] = left * a[i, i]
+                a[i, k] = up
+            pivot = a[k, k]
+            for j in range(k):
+                pivot -= a[k, j] * a[j, k]
+            a[k, k] = real(1.0) / pivot
         return a
 
     @wp.func
@@ -248,12 +257,9 @@ def functions(real, size: int) -> SimpleNamespace:
                 for j in range(k):
                     t -= y[j] * lu[j, k]
                 y[k] = t * lu[k, k]
-            for kk in range(size):
-                k = size - 1 - kk
-                t = y[k]
-                for j in range(k + 1, size):
-                    t -= y[j] * lu[j, k]
-                y[k] = t
+            for k in range(last, -1, -1):
+                for j in range(k):
+                    y[j] = y[j] - y[k] * lu[k, j]
             x[i] = y
         return x
 
@@ -265,12 +271,10 @@ def functions(real, size: int) -> SimpleNamespace:
             for j in range(i):
                 t -= lu[i, j] * y[j]
             y[i] = t
-        for ii in range(size):
-            i = size - 1 - ii
-            t = y[i]
-            for j in range(i + 1, size):
-                t -= lu[i, j] * y[j]
-            y[i] = t * lu[i, i]
+        for i in range(last, -1, -1):
+            y[i] = y[i] * lu[i, i]
+            for j in range(i):
+                y[j] = y[j] - lu[j, i] * y[i]
         return y
 
     @wp.func

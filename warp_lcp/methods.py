@@ -155,7 +155,7 @@ class VelocityPivoting:
             return
         n, contacts = len(self.movable), sim.model.max_contacts
         blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
-        self.slots = workspaces(sim.num_envs, 72 * (n + fill) + 24 * contacts, sim.device)
+        self.slots = workspaces(sim.num_envs, 72 * (n + fill) + 30 * contacts, sim.device)
         self.graph = graph_workspace(sim.real, 6, self.slots, n, blocks, fill, sim.device)
         ws = self.workspace = self.parts.Workspace()
         number = np.full(sim.model.num_bodies, -1, dtype=np.int32)
@@ -172,6 +172,7 @@ class VelocityPivoting:
             ("scratch", n, vec6),
             ("present", n, vec6),
             ("relaxed", contacts, t.vec3),
+            ("stiffness", contacts, t.vec3),
             ("ahead", contacts, t.vec3),
             ("expected", contacts, t.vec3),
             ("part", contacts, t.vec3),
