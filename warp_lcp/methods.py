@@ -139,7 +139,8 @@ class VelocityPivoting:
     """Principal pivoting on contact states in the velocities, for laws with two friction axes or a disc."""
 
     LIMIT = 12
-    NEWTON_LIMIT = 50
+    #: Solves of the first attempt with a line search, where several bodies move, and of the careful one.
+    NEWTON_LIMITS = (50, 300)
     #: Room for neighbours and for blocks of a triangular factor, per body.
     NEIGHBOURS, FILL = 32, 64
 
@@ -185,7 +186,7 @@ class VelocityPivoting:
         if self.single:
             sim.launch(self.kernel, [sim.bodies, int(self.movable[0]), sim.rows, todo, number, self.LIMIT, *tail])
         else:
-            inputs = [sim.bodies, sim.rows, todo, number, self.graph, self.workspace, self.LIMIT, self.NEWTON_LIMIT, *tail]
+            inputs = [sim.bodies, sim.rows, todo, number, self.graph, self.workspace, wp.vec3i(self.LIMIT, *self.NEWTON_LIMITS), *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
