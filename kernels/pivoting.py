@@ -14,10 +14,10 @@ its bodies' part of the system. One body: 6 unknowns in registers. Several: bloc
 neighbours (kernels/sparse.py).
 
 States whose sign conditions fail are flipped, all at once, until none does. Started from the states that the contact
-rows expect (loaded or not, sliding or sticking) that takes one to three solves. It may cycle: one body is then left to a
-safer method, several bodies to
+rows expect (loaded or not, sliding or sticking) that takes one to three solves. It may cycle: then an environment with one body
+stays unsolved and a safer method takes over; one with several goes on with a line search.
 
-Newton's method with a line search. Flipping all at once is Newton's method with full steps on
+Line search. Flipping all at once is Newton's method with full steps on
 
     R(x) = M x - J^T p(x) = 0,    p(x) = pi(-(f + J x) / eps)        (pi of kernels/friction.py),
 
@@ -646,9 +646,9 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         sync()
 
     @wp.func
-    def step_length(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, lane: int):
+    def step_length(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, enough: real, lane: int):
         """The part of the step after which dx . R is next to nothing, dx . R [J] before and after it, and how far the impulses
-        after the whole step are from those expected (the miss) [m/s].
+        after the whole step are from those expected (the miss) [m/s]; the whole step where that is no more than `enough`.
 
         R = M x - J^T p(x) is what is left of the momentum's balance. Where friction does not matter R is the gradient of a
         convex function, and this its least value along dx.
@@ -687,7 +687,7 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
             else:
                 low = length
             small = wp.abs(after) <= real(LINE_ACCURACY) * wp.abs(start)
-            if start >= real(0.0) or small or low == real(1.0) or looks == MOST_LOOKS:
+            if miss <= enough or start >= real(0.0) or small or low == real(1.0) or looks == MOST_LOOKS:
                 looking = False
             else:
                 length -= after / rate
@@ -803,18 +803,17 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
                     sync()
                 else:
                     begin_search(ws, bodies.com, bodies.inv_mass, bodies.inv_inertia, contacts, env, slot, r, lane)
-                    length, first, last, miss = step_length(ws, contacts, env, slot, r, lane)
-                    inner += 1
-                    done = miss <= real(MISS)
+                    enough = real(MISS)
                     if softness > real(0.0):
-                        done = miss <= real(SOFT_MISS[attempt - 1]) * size
+                        enough = real(SOFT_MISS[attempt - 1]) * size
+                    length, first, last, miss = step_length(ws, contacts, env, slot, r, enough, lane)
+                    inner += 1
+                    done = miss <= enough
                     uphill = first >= real(0.0) and (attempt > 1 or wp.abs(last) >= first)
                     if uphill and not done and follows > real(0.0):
                         follows = real(0.0)  # once more from here
                     else:
                         follows = real(1.0)
-                        if done:
-                            length = real(1.0)
                         for i in range(lane, r, wp.block_dim()):
                             ws.relaxed[slot, i] = ws.relaxed[slot, i] + length * ws.ahead[slot, i]
                         for b in range(lane, n, wp.block_dim()):
