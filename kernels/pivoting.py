@@ -14,8 +14,21 @@ its bodies' part of the system. One body: 6 unknowns in registers. Several: bloc
 neighbours (kernels/sparse.py).
 
 States whose sign conditions fail are flipped, all at once, until none does. Started from the states that the contact
-rows expect (loaded or not, sliding or sticking) that takes one to three solves. It may cycle: then the environment
-stays unsolved and a safer method takes over.
+rows expect (loaded or not, sliding or sticking) that takes one to three solves. It may cycle: then an environment with one body
+stays unsolved and a safer method takes over; one with several goes on with a line search.
+
+Line search. Flipping all at once is Newton's method with full steps on
+
+    R(x) = M x - J^T p(x) = 0,    p(x) = pi(-(f + J x) / eps)        (pi of kernels/friction.py),
+
+which is piecewise linear (the cone aside), with slopes that differ by 1e7 where a contact opens or closes. Without friction R is
+the gradient of a convex function, and a step dx that ends where dx . R(x + s dx) = 0 leads to its minimum from anywhere.
+Friction is no gradient; the rule works all the same. Where dx points uphill, dx . R >= 0, the step is found again
+without the growth of friction with p_n, which makes the matrix symmetric and positive definite.
+Steps are short where contacts are stiff, so contacts are softened, eps + softness W_ii, and hardened as soon as a step lands where
+it was aimed at. What fails so is tried once more with many small reductions of softness, each followed closely.
+x starts at zero: neither states nor history have a say. Each step solves for dx from the momentum R that is missing, so that
+round-off of one step is taken out by the next (residuals of 1e-15 m/s; solving for x itself left 1e-6 in stacks).
 
 Coulomb's cone (directions = 1) is the same thing with axes that turn: linearised at a slip y along s,
 
@@ -32,14 +45,26 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import sparse
-from .types import BLOCK_OPTIONS, CLOSED, scalar_types, sync
+from . import friction, sparse
+from .types import BLOCK_OPTIONS, CLOSED, ITERATION_LIMIT, scalar_types, sync
 
 AXIS_STICKS = 0
 AXIS_SLIDES_UP = 1  # along +t: the impulse is -mu p_n
 AXIS_SLIDES_DOWN = 2
 # Friction on the cone is linearised again while it misses its direction by more than this [m/s].
 CONE_TOLERANCE = wp.constant(1.0e-9)
+# Newton's method (see above), first and careful attempt: what the softness is multiplied by, where it becomes zero, the steps spent
+# on each, and when a step hits the problem: where no impulse is further from what was expected than this part of the largest
+# velocity. Softness starts at SOFTEST; at zero the answer is as exact as MISS [m/s].
+SOFTEST = 0.1
+HARDER = wp.constant(wp.vec2d(0.01, 0.316))
+HARDEST = wp.constant(wp.vec2d(0.9e-5, 1.0e-8))
+SOFT_STEPS = wp.constant(wp.vec2i(8, 20))
+SOFT_MISS = wp.constant(wp.vec2d(1.0e-2, 1.0e-4))
+MISS = 1.0e-9
+# The line search ends where dx . R has fallen to this part, or after so many looks.
+LINE_ACCURACY = 0.1
+MOST_LOOKS = 24
 
 
 @functools.cache
@@ -232,6 +257,8 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
     Bodies, Contacts = t.Bodies, t.Contacts
     f = functions(real, cone, frozen)
     operator, update = f.operator, f.update
+    law = friction.functions(real)
+    admissible, slope, weigh = law.admissible, law.slope, law.weigh
     s = sparse.functions(real, 6)
     Graph, clear, connect, analyse, clear_factors = s.Graph, s.clear, s.connect, s.analyse, s.clear_factors
     factorise, solve = s.factorise, s.solve
@@ -246,9 +273,16 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         contact: wp.array2d(dtype=int)  # [P, 2 R]
         matrix: wp.array2d(dtype=mat33)  # [P, R] K
         shift: wp.array2d(dtype=vec3)  # [P, R] g
-        change: wp.array2d(dtype=vec6)  # [P, n] x
+        change: wp.array2d(dtype=vec6)  # [P, n] what x becomes; while Newton's method runs dx
         scratch: wp.array2d(dtype=vec6)  # [P, n]
         flips: wp.array(dtype=int)  # [P]
+        # Of Newton's method with a line search:
+        present: wp.array2d(dtype=vec6)  # [P, n] x where the step starts
+        relaxed: wp.array2d(dtype=vec3)  # [P, R] f + J x there
+        stiffness: wp.array2d(dtype=vec3)  # [P, R] 1 / eps
+        ahead: wp.array2d(dtype=vec3)  # [P, R] J dx
+        expected: wp.array2d(dtype=vec3)  # [P, R] impulse after the step, if no contact changes state
+        part: wp.array2d(dtype=vec3)  # [P, R] what a contact adds to the numbers of the line search
 
     @wp.func
     def node(number: wp.array(dtype=int), body: int) -> int:
@@ -340,8 +374,9 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         vw = mat33()
         wv = mat33()
         ww = wp.inverse(inv_inertia[env, index])
-        bv = vec3()
-        bw = vec3()
+        x = ws.present[slot, b]
+        bv = -(vv * vec3(x[0], x[1], x[2]))
+        bw = -(ww * vec3(x[3], x[4], x[5]))
         for e in range(ws.begin[slot, b], ws.begin[slot, b + 1]):
             i = ws.contact[slot, e]
             pair = body[env, i]
@@ -378,6 +413,122 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
             u = vec3(x[0], x[1], x[2]) + wp.cross(vec3(x[3], x[4], x[5]), point - com[env, body])
         return u
 
+    @wp.func
+    def tangent(frame: mat33, relaxed: vec3, stiffness: vec3, mu: vec2, bound: vec2, k: int, follows: real):
+        """The impulse p = pi(-relaxed / eps) linearised: p - K J dx; K [kg] and -p [N s] in world axes, stiffness = 1 / eps.
+
+        follows = 0 leaves out that friction grows with the normal impulse, which makes K symmetric.
+        """
+        x = -wp.cw_mul(relaxed, stiffness)
+        d = slope(x, mu, bound, k)
+        d[1, 0] = follows * d[1, 0]
+        d[2, 0] = follows * d[2, 0]
+        back = wp.transpose(frame)
+        return back * (d * wp.diag(stiffness)) * frame, -(back * admissible(x, mu, bound, k))
+
+    @wp.func
+    def begin_search(
+        ws: Workspace,
+        com: wp.array2d(dtype=vec3),
+        inv_mass: wp.array2d(dtype=real),
+        inv_inertia: wp.array2d(dtype=mat33),
+        contacts: Contacts,
+        env: int,
+        slot: int,
+        r: int,
+        lane: int,
+    ):
+        """J dx, the impulses expected at x + dx, J dx . p(x), and in scratch dx . M x and dx . M dx of each body."""
+        for i in range(lane, r, wp.block_dim()):
+            body = contacts.body[env, i]
+            point = contacts.point[env, i]
+            frame = contacts.frame[env, i]
+            du = body_change(ws, com, env, slot, body[1], point) - body_change(ws, com, env, slot, body[0], point)
+            ws.ahead[slot, i] = frame * du
+            shift = ws.shift[slot, i]
+            ws.expected[slot, i] = -(frame * (ws.matrix[slot, i] * du + shift))
+            ws.part[slot, i] = vec3(-wp.dot(du, shift), real(0.0), real(0.0))
+        for b in range(lane, ws.body.shape[0], wp.block_dim()):
+            index = ws.body[b]
+            x = ws.present[slot, b]
+            d = ws.change[slot, b]
+            dv = vec3(d[0], d[1], d[2]) / inv_mass[env, index]
+            dw = wp.inverse(inv_inertia[env, index]) * vec3(d[3], d[4], d[5])
+            momentum = vec6(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
+            ws.scratch[slot, b] = vec6(wp.dot(momentum, x), wp.dot(momentum, d), real(0.0), real(0.0), real(0.0), real(0.0))
+        sync()
+
+    @wp.func
+    def look(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, length: real, lane: int):
+        """Impulses at x + length dx, and what contacts add to dx . R there, to its derivative and to the miss (`step_length`)."""
+        for i in range(lane, r, wp.block_dim()):
+            k = contacts.directions[env, i]
+            mu = contacts.mu[env, i]
+            bound = contacts.bound[env, i]
+            stiffness = ws.stiffness[slot, i]
+            ahead = ws.ahead[slot, i]
+            x = -wp.cw_mul(ws.relaxed[slot, i] + length * ahead, stiffness)
+            p = admissible(x, mu, bound, k)
+            contacts.impulse[env, i] = p
+            part = vec3(wp.dot(ahead, p), wp.dot(ahead, slope(x, mu, bound, k) * wp.cw_mul(ahead, stiffness)), real(0.0))
+            if length == real(1.0):
+                part[2] = wp.max(wp.cw_mul(weigh(contacts.inv_mass[env, i], k), wp.abs(p - ws.expected[slot, i])))
+            ws.part[slot, i] = part
+        sync()
+
+    @wp.func
+    def step_length(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, enough: real, lane: int):
+        """The part of the step after which dx . R is next to nothing, dx . R [J] before and after it, and how far the impulses
+        after the whole step are from those expected (the miss) [m/s]; the whole step where that is no more than `enough`.
+
+        R = M x - J^T p(x) is what is left of the momentum's balance. Where friction does not matter R is the gradient of a
+        convex function, and this its least value along dx.
+        """
+        start = real(0.0)
+        mass = real(0.0)
+        for b in range(ws.body.shape[0]):
+            moved = ws.scratch[slot, b]
+            start += moved[0]
+            mass += moved[1]
+        balance = start
+        for i in range(r):
+            start -= ws.part[slot, i][0]
+        sync()
+        length = real(1.0)
+        low = real(0.0)
+        high = real(1.0)
+        after = real(0.0)
+        miss = real(0.0)
+        looks = int(0)
+        looking = bool(True)
+        while looking:
+            look(ws, contacts, env, slot, r, length, lane)
+            after = balance + length * mass
+            rate = mass
+            for i in range(r):
+                part = ws.part[slot, i]
+                after -= part[0]
+                rate += part[1]
+                if looks == 0:
+                    miss = wp.max(miss, part[2])
+            sync()
+            looks += 1
+            if after > real(0.0):
+                high = length
+            else:
+                low = length
+            small = wp.abs(after) <= real(LINE_ACCURACY) * wp.abs(start)
+            if miss <= enough or start >= real(0.0) or small or low == real(1.0) or looks == MOST_LOOKS:
+                looking = False
+            else:
+                length -= after / rate
+                if not (length > low and length < high):
+                    # Contacts may differ in stiffness by a factor of 1e7.
+                    length = real(0.5) * (low + high)
+                    if low == real(0.0):
+                        length = real(0.1) * high
+        return length, start, after, miss
+
     @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def pivot(
         bodies: Bodies,
@@ -386,40 +537,61 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         number: wp.array(dtype=int),
         g: Graph,
         ws: Workspace,
-        limit: int,
+        limits: wp.vec3i,
         tolerance: real,
         iterations: wp.array(dtype=int),
+        reason: wp.array(dtype=int),
     ):
         slot, lane = wp.tid()
         n = ws.body.shape[0]
         for index in range(slot, number[0], ws.flips.shape[0]):
             env = todo[index]
             r = contacts.count[env]
-            flips = r
             solves = int(0)
-            if r > 0:
+            searching = r > 0
+            if searching:
                 list_contacts(ws, contacts.body, env, slot, r, lane)
-                if not couple(g, ws, contacts.body, env, slot, lane):
-                    flips = 0
-            while flips > 0 and solves < limit:
+                searching = couple(g, ws, contacts.body, env, slot, lane)
+            stopped = r > 0 and not searching
+            for b in range(lane, n, wp.block_dim()):
+                ws.present[slot, b] = vec6()
+            attempt = int(0)  # flips, then Newton's method, then the same carefully
+            limit = limits[0]
+            softness = real(0.0)
+            follows = real(1.0)
+            size = real(0.0)
+            inner = int(0)
+            while searching:
+                # Each function is called in one place: Warp's compilers inline them all.
                 clear_factors(g, slot, n, lane)
                 for i in range(lane, r, wp.block_dim()):
                     bound = vec2()
                     if wp.static(frozen):
                         bound = contacts.bound[env, i]
-                    slip = vec3()
-                    if wp.static(cone):
-                        slip = contacts.slip[env, i]
-                    matrix, shift = operator(
-                        contacts.frame[env, i],
-                        contacts.relaxation[env, i],
-                        contacts.free[env, i],
-                        contacts.mu[env, i],
-                        bound,
-                        contacts.directions[env, i],
-                        contacts.state[env, i],
-                        slip,
-                    )
+                    matrix = mat33()
+                    shift = vec3()
+                    if attempt == 0:
+                        slip = vec3()
+                        if wp.static(cone):
+                            slip = contacts.slip[env, i]
+                        matrix, shift = operator(
+                            contacts.frame[env, i],
+                            contacts.relaxation[env, i],
+                            contacts.free[env, i],
+                            contacts.mu[env, i],
+                            bound,
+                            contacts.directions[env, i],
+                            contacts.state[env, i],
+                            slip,
+                        )
+                    else:
+                        k = contacts.directions[env, i]
+                        eps = contacts.relaxation[env, i] + softness * weigh(contacts.inv_mass[env, i], k)
+                        stiffness = wp.cw_div(vec3(real(1.0)), eps)
+                        ws.stiffness[slot, i] = stiffness
+                        matrix, shift = tangent(
+                            contacts.frame[env, i], ws.relaxed[slot, i], stiffness, contacts.mu[env, i], bound, k, follows
+                        )
                     ws.matrix[slot, i] = matrix
                     ws.shift[slot, i] = shift
                 if lane == 0:
@@ -430,39 +602,84 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
                 sync()
                 factorise(g, slot, n, lane)
                 solve(g, slot, n, ws.change, ws.scratch, lane)
-                for i in range(lane, r, wp.block_dim()):
-                    body = contacts.body[env, i]
-                    point = contacts.point[env, i]
-                    du = body_change(ws, bodies.com, env, slot, body[1], point) - body_change(ws, bodies.com, env, slot, body[0], point)
-                    bound = vec2()
-                    if wp.static(frozen):
-                        bound = contacts.bound[env, i]
-                    slip = vec3()
-                    if wp.static(cone):
-                        slip = contacts.slip[env, i]
-                    p, after, turned, again = update(
-                        contacts.free[env, i] + contacts.frame[env, i] * du,
-                        contacts.relaxation[env, i],
-                        contacts.inv_mass[env, i],
-                        contacts.mu[env, i],
-                        bound,
-                        contacts.directions[env, i],
-                        contacts.state[env, i],
-                        slip,
-                        tolerance,
-                    )
-                    contacts.impulse[env, i] = p
-                    if again:
-                        wp.atomic_add(ws.flips, slot, 1)
-                        contacts.state[env, i] = after
-                        if wp.static(cone):
-                            contacts.slip[env, i] = turned
-                sync()
-                flips = ws.flips[slot]
                 solves += 1
-                sync()
+                if attempt == 0:
+                    for i in range(lane, r, wp.block_dim()):
+                        body = contacts.body[env, i]
+                        point = contacts.point[env, i]
+                        du = body_change(ws, bodies.com, env, slot, body[1], point) - body_change(ws, bodies.com, env, slot, body[0], point)
+                        bound = vec2()
+                        if wp.static(frozen):
+                            bound = contacts.bound[env, i]
+                        slip = vec3()
+                        if wp.static(cone):
+                            slip = contacts.slip[env, i]
+                        p, after, turned, again = update(
+                            contacts.free[env, i] + contacts.frame[env, i] * du,
+                            contacts.relaxation[env, i],
+                            contacts.inv_mass[env, i],
+                            contacts.mu[env, i],
+                            bound,
+                            contacts.directions[env, i],
+                            contacts.state[env, i],
+                            slip,
+                            tolerance,
+                        )
+                        contacts.impulse[env, i] = p
+                        if again:
+                            wp.atomic_add(ws.flips, slot, 1)
+                            contacts.state[env, i] = after
+                            if wp.static(cone):
+                                contacts.slip[env, i] = turned
+                    sync()
+                    searching = ws.flips[slot] > 0
+                    sync()
+                else:
+                    begin_search(ws, bodies.com, bodies.inv_mass, bodies.inv_inertia, contacts, env, slot, r, lane)
+                    enough = real(MISS)
+                    if softness > real(0.0):
+                        enough = real(SOFT_MISS[attempt - 1]) * size
+                    length, first, last, miss = step_length(ws, contacts, env, slot, r, enough, lane)
+                    inner += 1
+                    done = miss <= enough
+                    uphill = first >= real(0.0) and (attempt > 1 or wp.abs(last) >= first)
+                    if uphill and not done and follows > real(0.0):
+                        follows = real(0.0)  # once more from here
+                    else:
+                        follows = real(1.0)
+                        for i in range(lane, r, wp.block_dim()):
+                            ws.relaxed[slot, i] = ws.relaxed[slot, i] + length * ws.ahead[slot, i]
+                        for b in range(lane, n, wp.block_dim()):
+                            ws.present[slot, b] = ws.present[slot, b] + length * ws.change[slot, b]
+                        sync()
+                    searching = not done or softness > real(0.0)
+                    if softness > real(0.0) and (done or inner >= SOFT_STEPS[attempt - 1]):
+                        inner = 0
+                        softness = real(HARDER[attempt - 1]) * softness
+                        if softness < real(HARDEST[attempt - 1]):
+                            softness = real(0.0)
+                if searching and solves >= limit:
+                    # Again, from no impulse at all and with soft contacts.
+                    attempt += 1
+                    searching = attempt <= 2
+                    stopped = not searching
+                    if searching:
+                        limit = solves + limits[attempt]
+                    softness = real(SOFTEST)
+                    follows = real(1.0)
+                    inner = 0
+                    size = real(0.0)
+                    for i in range(r):
+                        size = wp.max(size, wp.max(wp.abs(contacts.free[env, i])))
+                    for i in range(lane, r, wp.block_dim()):
+                        ws.relaxed[slot, i] = contacts.free[env, i]
+                    for b in range(lane, n, wp.block_dim()):
+                        ws.present[slot, b] = vec6()
+                    sync()
             if lane == 0:
                 iterations[env] = iterations[env] + solves
+                if stopped:
+                    reason[env] = reason[env] | ITERATION_LIMIT
             sync()
 
     return SimpleNamespace(Graph=Graph, Workspace=Workspace, pivot=pivot)

@@ -227,6 +227,8 @@ def functions(real, size: int) -> SimpleNamespace:
                             b[i, j] = b[i, j] - f * b[k, j]
         return b
 
+    # Bounds of the loops below are static: Warp unrolls no loop that starts at k + 1.
+
     @wp.func
     def lower_upper(a: matrix) -> matrix:
         """L and U of a block in one matrix: L below the diagonal, U above, 1 / U_kk on it."""

@@ -164,6 +164,8 @@ class VelocityPivoting(Method):
     """Principal pivoting on contact states in the velocities, for laws with two friction axes or a disc."""
 
     LIMIT = 12
+    #: Solves of the first attempt with a line search, where several bodies move, and of the careful one.
+    NEWTON_LIMITS = (50, 300)
     #: Room for neighbours and for blocks of a triangular factor, per body.
     NEIGHBOURS, FILL = 32, 64
 
@@ -190,7 +192,7 @@ class VelocityPivoting(Method):
             return
         n, contacts = len(self.movable), sim.model.max_contacts
         blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
-        self.slots = workspaces(sim.num_envs, 54 * n + blocks + 73 * fill + 13 * contacts, sim.device)
+        self.slots = workspaces(sim.num_envs, 60 * n + blocks + 73 * fill + 28 * contacts, sim.device)
         self.graph = graph_workspace(sim.real, 6, self.slots, n, blocks, fill, sim.device)
         ws = self.workspace = self.parts.Workspace()
         number = np.full(sim.model.num_bodies, -1, dtype=np.int32)
@@ -205,6 +207,12 @@ class VelocityPivoting(Method):
             ("shift", contacts, t.vec3),
             ("change", n, vec6),
             ("scratch", n, vec6),
+            ("present", n, vec6),
+            ("relaxed", contacts, t.vec3),
+            ("stiffness", contacts, t.vec3),
+            ("ahead", contacts, t.vec3),
+            ("expected", contacts, t.vec3),
+            ("part", contacts, t.vec3),
         ):
             setattr(ws, name, wp.empty((self.slots, max(width, 1)), dtype=dtype, device=sim.device))
         ws.flips = wp.zeros(self.slots, dtype=int, device=sim.device)
@@ -217,7 +225,7 @@ class VelocityPivoting(Method):
             limits = [self.LIMIT, sim.sign_tolerance, sim.tolerance]
             sim.launch(self.kernel, [*scene, sim.dt, *sim.law.row_arguments, *limits, sim.next_velocity, *lists, *answer])
         else:
-            tail = [self.LIMIT, sim.sign_tolerance, sim.iterations]
+            tail = [wp.vec3i(self.LIMIT, *self.NEWTON_LIMITS), sim.sign_tolerance, sim.iterations, sim.reason]
             inputs = [sim.bodies, sim.rows, todo, number, self.graph, self.workspace, *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
