@@ -111,10 +111,9 @@ def make(real, cone: bool, frozen: bool, rows: bool):
             env = natural(todo[index])
             count = contacts.count[env]
             com = bodies.com[env, body]
-            inv_mass = bodies.inv_mass[env, body]
-            inv_inertia = bodies.inv_inertia[env, body]
-
             if wp.static(rows):
+                inv_mass = bodies.inv_mass[env, body]
+                inv_inertia = bodies.inv_inertia[env, body]
                 for ii in range(count):
                     i = natural(ii)
                     slot = natural(contacts.slot[env, i])
@@ -130,19 +129,15 @@ def make(real, cone: bool, frozen: bool, rows: bool):
                     row.inv_mass = vec3(w_nn, w_1, w_2)
                     write_row(contacts, env, i, pair_body, point, slots.gap[env, slot], row)
 
-            mass = mat33()
-            inertia = mat33()
-            if count > 0:
-                mass = wp.diag(vec3(real(1.0) / inv_mass))
-                inertia = wp.inverse(inv_inertia)
             total = spatial()
             flips = count
             solves = int(0)
             while flips > 0 and solves < limit:
-                vv = mass
+                # Not kept from one solve to the next: registers are short.
+                vv = wp.diag(vec3(real(1.0) / bodies.inv_mass[env, body]))
                 vw = mat33()
                 wv = mat33()
-                ww = inertia
+                ww = wp.inverse(bodies.inv_inertia[env, body])
                 bv = vec3()
                 bw = vec3()
                 for ii in range(count):
@@ -218,7 +213,7 @@ def make(real, cone: bool, frozen: bool, rows: bool):
                 reason[env] = reason[env] | ITERATION_LIMIT
 
             # The certificate, from the impulses alone: what their wrench changes, not what the system above says.
-            change = response(inv_mass, inv_inertia, total)
+            change = response(bodies.inv_mass[env, body], bodies.inv_inertia[env, body], total)
             dv = wp.spatial_top(change)
             dw = wp.spatial_bottom(change)
             worst = real(0.0)
