@@ -45,7 +45,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import friction, sparse
+from . import friction, rigid, sparse
 from .types import BLOCK_OPTIONS, CLOSED, ITERATION_LIMIT, scalar_types, sync
 
 AXIS_STICKS = 0
@@ -259,6 +259,7 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
     operator, update = f.operator, f.update
     law = friction.functions(real)
     admissible, slope, weigh = law.admissible, law.slope, law.weigh
+    times_skew, skew_times = rigid.functions(real).times_skew, rigid.functions(real).skew_times
     s = sparse.functions(real, 6)
     Graph, clear, connect, analyse, clear_factors = s.Graph, s.clear, s.connect, s.analyse, s.clear_factors
     factorise, solve = s.factorise, s.solve
@@ -387,19 +388,18 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
                 shift = -shift
                 other = pair[1]
             arm = point[env, i] - com[env, index]
-            turn = wp.skew(arm)
-            right = matrix * turn
-            left = turn * matrix
+            right = times_skew(matrix, arm)
+            left = skew_times(arm, matrix)
             vv += matrix
             vw -= right
             wv += left
-            ww -= turn * right
+            ww -= skew_times(arm, right)
             bv -= shift
             bw -= wp.cross(arm, shift)
             column = node(ws.number, other)
             if column >= 0:
-                far = wp.skew(point[env, i] - com[env, other])
-                add_block(g, slot, b, column, blocks(matrix, -(matrix * far), left, -(left * far)))
+                far = point[env, i] - com[env, other]
+                add_block(g, slot, b, column, blocks(matrix, -times_skew(matrix, far), left, -times_skew(left, far)))
         g.pivot[slot, g.step[slot, b]] = blocks(vv, vw, wv, ww)
         ws.change[slot, b] = vec6(bv[0], bv[1], bv[2], bw[0], bw[1], bw[2])
 

@@ -34,9 +34,22 @@ def functions(real) -> SimpleNamespace:
         return spatial(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
 
     @wp.func
+    def times_skew(m: mat33, r: vec3) -> mat33:
+        """M [r], without the products with its zeros."""
+        return wp.matrix_from_rows(wp.cross(m[0], r), wp.cross(m[1], r), wp.cross(m[2], r))
+
+    @wp.func
+    def skew_times(r: vec3, m: mat33) -> mat33:
+        """[r] M, likewise."""
+        x = wp.cross(r, vec3(m[0, 0], m[1, 0], m[2, 0]))
+        y = wp.cross(r, vec3(m[0, 1], m[1, 1], m[2, 1]))
+        z = wp.cross(r, vec3(m[0, 2], m[1, 2], m[2, 2]))
+        return wp.matrix_from_cols(x, y, z)
+
+    @wp.func
     def mobility(inv_mass: real, inv_inertia: mat33, arm: vec3, other: vec3) -> mat33:
         """J M^-1 J^T between two points of a body: velocity at `arm` for an impulse at `other`, 1/m E - [arm] I^-1 [other]."""
-        return wp.diag(vec3(inv_mass)) - wp.skew(arm) * inv_inertia * wp.skew(other)
+        return wp.diag(vec3(inv_mass)) - skew_times(arm, times_skew(inv_inertia, other))
 
     @wp.func
     def direction_mobility(inv_mass: real, inv_inertia: mat33, arm: vec3, direction: vec3) -> real:
@@ -74,6 +87,8 @@ def functions(real) -> SimpleNamespace:
         point_velocity=point_velocity,
         wrench=wrench,
         response=response,
+        times_skew=times_skew,
+        skew_times=skew_times,
         mobility=mobility,
         delassus=delassus,
         direction_mobility=direction_mobility,

@@ -30,24 +30,12 @@ def make(real, cone: bool, frozen: bool, rows: bool):
     judge, remember = certificate.judge, certificate.remember
     body_functions = rigid.functions(real)
     direction_mobility, wrench, response = body_functions.direction_mobility, body_functions.wrench, body_functions.response
+    times_skew, skew_times = body_functions.times_skew, body_functions.skew_times
 
     @wp.func
     def natural(i: int) -> int:
         """An index that is not to be counted from the end: knowing that saves the compiler three instructions an access."""
         return wp.max(i, 0)
-
-    @wp.func
-    def times_skew(m: mat33, r: vec3) -> mat33:
-        """M [r], without the products with its zeros."""
-        return wp.matrix_from_rows(wp.cross(m[0], r), wp.cross(m[1], r), wp.cross(m[2], r))
-
-    @wp.func
-    def skew_times(r: vec3, m: mat33) -> mat33:
-        """[r] M, likewise."""
-        x = wp.cross(r, vec3(m[0, 0], m[1, 0], m[2, 0]))
-        y = wp.cross(r, vec3(m[0, 1], m[1, 1], m[2, 1]))
-        z = wp.cross(r, vec3(m[0, 2], m[1, 2], m[2, 2]))
-        return wp.matrix_from_cols(x, y, z)
 
     @wp.func
     def solve(vv: mat33, vw: mat33, wv: mat33, ww: mat33, bv: vec3, bw: vec3) -> vec6:
