@@ -6,7 +6,7 @@ each contact gets its row. The frame of every
 contact is chosen so that t1 is the direction that matters: the sliding direction while it slides, the direction in
 which it would slip while it sticks. E of eq. 18 is then the same k directions at angles j pi / k for every contact.
 
-Functions take numbers, not bundles of arrays: Warp passes a bundle by value, a kilobyte a call.
+Functions that take bundles of arrays are called in one place of a kernel, where compilers inline them: a call would copy a kilobyte.
 """
 
 import functools
@@ -165,7 +165,7 @@ def row_functions(real) -> SimpleNamespace:
         if directions < 0:  # Anitescu and Potra: rigid friction, no bristles
             eps_t = real(0.0)
         slip = tangent_part(u, n)
-        slides = wp.length_sq(slip) >= c[4] * c[4]
+        slides = wp.length_sq(slip) >= c[4] * c[4] and wp.length_sq(slip) > real(0.0)  # a tiny threshold is 0 when squared
         speed = real(0.0)
         mu = friction[0]
         if slides:

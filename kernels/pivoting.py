@@ -23,8 +23,9 @@ Line search. Flipping all at once is Newton's method with full steps on
 
 which is piecewise linear (the cone aside), with slopes that differ by 1e7 where a contact opens or closes. Without friction R is
 the gradient of a convex function, and a step dx that ends where dx . R(x + s dx) = 0 leads to its minimum from anywhere.
-Friction is no gradient; the rule works all the same. Where dx points uphill, dx . R >= 0, the step is found again
-without the growth of friction with p_n, which makes the matrix symmetric and positive definite.
+Friction is no gradient; the rule works all the same. Where dx points uphill, dx . R >= 0, it is taken whole if |dx . R| falls
+(first attempt only), otherwise found again without the growth of friction with p_n, which makes the matrix symmetric and
+positive definite.
 Steps are short where contacts are stiff, so contacts are softened, eps + softness W_ii, and hardened as soon as a step lands where
 it was aimed at. What fails so is tried once more with many small reductions of softness, each followed closely.
 x starts at zero: neither states nor history have a say. Each step solves for dx from the momentum R that is missing, so that
@@ -479,7 +480,8 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
     @wp.func
     def step_length(ws: Workspace, contacts: Contacts, env: int, slot: int, r: int, enough: real, lane: int):
         """The part of the step after which dx . R is next to nothing, dx . R [J] before and after it, and how far the impulses
-        after the whole step are from those expected (the miss) [m/s]; the whole step where that is no more than `enough`.
+        after the whole step are from those expected (the miss) [m/s]; the whole step where that is no more than `enough`, or where
+        dx points uphill.
 
         R = M x - J^T p(x) is what is left of the momentum's balance. Where friction does not matter R is the gradient of a
         convex function, and this its least value along dx.

@@ -10,8 +10,8 @@ the energy that they add to the motion, in velocities relative to the surfaces, 
 by moving is not counted. Nor is the speed s at which overlaps that do not bounce are pushed apart: u_n+ - s stands for u_n+
 there. Where W > 0 it has the environment solved again with theta e for 0 <= theta <= 1: for theta = 0 first, then by
 interpolation for the largest theta that adds nothing. W is a quadratic in theta as long as no contact changes its state, so
-the third point gives the answer. Environments that are done show the methods no contacts meanwhile; where all are done, which
-is the rule, none of this is launched.
+the third point gives the answer. Environments that are done are not listed for it; where all are done, which is the rule, none
+of this is launched.
 
 Both -e u_n- and W look at u- at the start of the step, not at u_free. With M (v_free - v) = h f and constant f, Euler's rule
 keeps E + h f . v / 2, whose change by impulses is W exactly; so is that of E by the midpoint rule. With u_free in W a box could

@@ -206,7 +206,7 @@ def make(real, cone: bool, frozen: bool, rows: bool):
             dw = wp.spatial_bottom(change)
             worst = real(0.0)
             energy = real(0.0)
-            finite = wp.isfinite(change) and wp.isfinite(com)
+            finite = wp.isfinite(change)
             for ii in range(count):
                 i = natural(ii)
                 p = contacts.impulse[env, i]
@@ -235,7 +235,7 @@ def make(real, cone: bool, frozen: bool, rows: bool):
                 remember(slots, env, contacts.slot[env, i], contacts.closed[env, i], rate, frame, p, ended, contacts.damping[env, i])
             for b in range(next_velocity.shape[1]):
                 next_velocity[env, b] = bodies.free_velocity[env, b]
-                finite = finite and wp.isfinite(next_velocity[env, b])
+                finite = finite and wp.isfinite(next_velocity[env, b]) and wp.isfinite(bodies.com[env, b])
             next_velocity[env, body] = next_velocity[env, body] + change
             residual[env] = worst
             residual_energy[env] = energy

@@ -150,6 +150,34 @@ def test_workspaces_take_what_they_are_counted_at(monkeypatch, method):
     assert total / 3 == pytest.approx(8 * counted[0], rel=0.03)
 
 
+@pytest.mark.parametrize("method", ["auto", "velocity_pivoting", "proximal_newton", "pgs", "lemke"])
+@pytest.mark.parametrize("entry", [0, 5])
+def test_a_nan_in_a_kinematic_partner_is_flagged(method, entry):
+    """Its contacts vanish, for a gap that is not a number is none; what is left of the problem is solved, and not OK."""
+    builder = wl.ModelBuilder()
+    builder.add_box(builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1)), (0.1, 0.1, 0.1))
+    builder.add_box(builder.add_body(pose=(0, 0, -0.1, 0, 0, 0, 1), joint=wl.JointType.KINEMATIC), (1, 1, 0.1))
+    sim = simulator(builder, 2, method=method)
+    sim.step(2)
+    assert (sim.status.numpy() & wl.Status.NOT_A_NUMBER == 0).all()
+    q = sim.q.numpy()
+    q[1, 7 + entry] = np.nan
+    sim.q.assign(q)
+    sim.step()
+    assert (sim.status.numpy() & wl.Status.NOT_A_NUMBER != 0).tolist() == [False, True]
+
+
+def test_methods_come_in_any_order(monkeypatch):
+    """One that makes its rows and judges its answers, behind another that gives up: it takes the rows there are."""
+    monkeypatch.setattr(methods.BlockPGS, "SWEEPS", 0)
+    monkeypatch.setitem(methods.METHODS, "auto", (methods.BlockPGS, methods.VelocityPivoting))
+    alone, behind = simulator(paper_box(), 3, method="velocity_pivoting"), simulator(paper_box(), 3)
+    for sim in (alone, behind):
+        sim.step(20)
+        assert (sim.status.numpy() == 0).all()
+    assert behind.v.numpy() == pytest.approx(alone.v.numpy(), abs=1e-9)
+
+
 def test_a_nan_is_flagged_contained_and_healed_by_a_masked_reset():
     fresh = simulator(paper_box(), 8)
     fresh.step(50)

@@ -81,6 +81,17 @@ def test_frictionless_block_never_stops():
     assert sim.q.numpy()[0, :2] == pytest.approx([0.2, 0.1], abs=1e-10)
 
 
+@pytest.mark.parametrize(("precision", "threshold"), [("float64", 1e-200), ("float32", 1e-30)])
+def test_a_slip_threshold_that_is_zero_when_squared(precision, threshold):
+    """A block at rest does not slide, whatever the threshold, and stays where it is."""
+    builder = wl.ModelBuilder()
+    builder.add_plane(material=wl.Material(slip_threshold=threshold))
+    builder.add_box(builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1)), (0.1, 0.1, 0.1), material=wl.Material(slip_threshold=threshold))
+    sim = simulator(builder, precision=precision)
+    sim.step(5)
+    assert sim.q.numpy()[0] == pytest.approx([0, 0, 0.1, 0, 0, 0, 1], abs=1e-6)
+
+
 @pytest.mark.parametrize("h", [1e-2, 1e-3])
 def test_sphere_slips_then_rolls(h):
     """v = 5/7 v0 and omega = v / R from then on, at any step size: angular momentum about the ground is conserved.

@@ -198,7 +198,7 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
     total += 2 * model.num_bodies * wp.types.type_size_in_bytes(types.spatial)  # wrench, next velocity
     total += 4 * 4 + 3 * 8  # status, iterations, unsolved, reason; residuals
     methods = [method(model, wp.float64, law) for method in chosen("auto", "float64", law)]
-    total += 4 * (len(methods) + methods[0].judges)  # lists of environments
+    total += 4 * (len(methods) + any(method.judges for method in methods))  # lists of environments
     for bundle, width in widths.items():
         for name, variable in bundle.vars.items():
             if (name == "slip" and not law.is_cone) or name in ("coefficient", "again"):  # the latter for all alike

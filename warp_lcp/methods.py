@@ -92,7 +92,7 @@ class Method:
     """``kernel`` (chosen for a model), ``prepare`` (allocate, once) and ``launch`` (record, no host read-back).
 
     Attributes:
-        makes_rows: the kernel makes the contact rows as well, if it is the first of a step.
+        makes_rows: the kernel makes the contact rows as well, until :meth:`take_rows`.
         judges: the kernel certifies its answers, and lists those that it cannot in sim.doubtful[:sim.num_doubtful].
     """
 
@@ -104,7 +104,7 @@ class Method:
         """Allocate what the kernel needs."""
 
     def take_rows(self) -> None:
-        """From now on rows are made, and changed, before they are solved (kernels/restitution.py)."""
+        """From now on the kernel solves rows that are there: others made them, changed them (kernels/restitution.py) or tried them."""
 
     def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
         """The environments todo[:number] that are listed on the device."""

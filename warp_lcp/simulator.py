@@ -378,10 +378,11 @@ class Simulator:
     def _solve_kernels(self, todo: wp.array, number: wp.array, status: wp.array) -> None:
         """The environments todo[:number] by the first method, those left by the next, and so on; each answer certified."""
         self.queued.zero_()
-        self.num_doubtful.zero_()
         self._solve_with(0, todo, number, status)
 
     def _solve_with(self, i: int, todo: wp.array, number: wp.array, status: wp.array) -> None:
+        if self._methods[i].judges:
+            self.num_doubtful.zero_()
         self._methods[i].launch(self, todo, number)
         if self._methods[i].judges:
             self._where(self.num_doubtful, lambda: self._certify(i, self.doubtful, self.num_doubtful, status))
@@ -514,10 +515,12 @@ class Simulator:
     def _load_kernels(self) -> None:
         self._methods = [method(self.model, self.real, self.law) for method in chosen(self.method, self.precision, self.law)]
         self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator, self._methods[0].makes_rows)
+        for method in self._methods[1:]:
+            method.take_rows()
         for method in self._methods:
             method.prepare(self)
-        # Environments that each method but the last leaves to the next, and those whose answer the first could not certify.
-        left, doubtful = len(self._methods) - 1, self.num_envs if self._methods[0].judges else 0
+        # Environments that each method but the last leaves to the next, and those whose answer a method could not certify itself.
+        left, doubtful = len(self._methods) - 1, self.num_envs if any(method.judges for method in self._methods) else 0
         self.queues: wp.array = wp.empty((left, self.num_envs), dtype=int, device=self.device)
         self.queued: wp.array = wp.zeros(left, dtype=int, device=self.device)
         self.doubtful: wp.array = wp.empty(doubtful, dtype=int, device=self.device)
