@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import enum
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -527,16 +529,18 @@ class Simulator:
         self.num_doubtful: wp.array = wp.zeros(1, dtype=int, device=self.device)
         pair_kernels = [kernel for kernel, *_ in self._pair_kernels]
         self.kernels: list[Any] = []
-        self._load([*vars(self._kernels).values(), *pair_kernels, *(m.kernel for m in self._methods)])
+        self._load([*(m.kernel for m in reversed(self._methods)), *pair_kernels, *vars(self._kernels).values()])  # long ones first
 
     def _load(self, kernels: list[Any]) -> None:
         """Compile kernels, side by side, and put them on the device."""
         self.kernels += kernels
-        by_block: dict[int, list[Any]] = {}
-        for kernel in kernels:
-            by_block.setdefault(kernel.module.options["block_dim"], []).append(kernel.module)
-        for block_dim, modules in by_block.items():
-            wp.force_load(self.device, modules=modules, block_dim=block_dim)
+
+        def load(kernel: Any) -> None:
+            wp.force_load(self.device, modules=[kernel.module], block_dim=kernel.module.options["block_dim"])
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            for done in [pool.submit(load, kernel) for kernel in kernels]:
+                done.result()
 
 
 def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
