@@ -331,9 +331,12 @@ def test_scenes_without_contacts_or_movable_bodies():
     [
         ({"dt": np.nan}, "dt is nan s; it must be finite"),
         ({"dt": -1e-3}, "greater than zero"),
+        ({"dt": "0.01"}, "dt is '0.01'; it must be finite"),
+        ({"dt": [0.01, 0.02]}, r"dt is \[0.01, 0.02\] s; it must be finite"),
         ({"num_envs": 0}, "num_envs is 0; give a whole number of at least 1"),
         ({"directions": 1}, "directions is 1"),
         ({"rho_scale": 0.0}, "rho_scale is 0.0"),
+        ({"rho_scale": None}, "rho_scale is None"),
         ({"method": "simplex"}, "method is 'simplex'; choose one of auto, velocity_pivoting, proximal_newton, pgs, lemke, murty"),
         ({"precision": "half"}, "choose one of float64, float32"),
         ({"formulation": "magic"}, "choose one of phantom_inertia"),

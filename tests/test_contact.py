@@ -265,7 +265,7 @@ def test_what_is_not_a_number_is_never_solved(monkeypatch, heap):
 
 @pytest.mark.parametrize("tolerance", [-1.0, 0.0, np.nan])
 def test_tolerance_is_checked(tolerance):
-    with pytest.raises(wl.WarpLcpError, match=r"tolerance is .*; it must be greater than zero"):
+    with pytest.raises(wl.WarpLcpError, match=r"tolerance is .*; it must be finite and greater than zero"):
         wl.solve_contact(np.eye(3), np.zeros(3), 0.5, tolerance=tolerance, device="cpu")
 
 

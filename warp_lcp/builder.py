@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 
 import numpy as np
 
-from .errors import ModelError
+from .errors import ModelError, positive_number
 from .model import CONTACT_POINTS, JointType, Material, Model, Report, ShapeType
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -307,6 +308,9 @@ class ModelBuilder:
         return np.array([p[2:] for p in sorted(pairs)], dtype=np.int32).reshape(-1, 2)
 
 
+_positive = partial(positive_number, error=ModelError)
+
+
 def _vector(what: str, value: Sequence[float], n: int) -> np.ndarray:
     array = np.asarray(value, dtype=float)
     if array.shape != (n,):
@@ -314,12 +318,6 @@ def _vector(what: str, value: Sequence[float], n: int) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ModelError(f"{what} is {array.tolist()}; every number must be finite")
     return array
-
-
-def _positive(what: str, value: float, unit: str) -> float:
-    if not (np.isfinite(value) and value > 0.0):
-        raise ModelError(f"{what} is {value} {unit}; it must be finite and greater than zero")
-    return float(value)
 
 
 def _pose(name: str, value: Sequence[float]) -> np.ndarray:

@@ -43,3 +43,16 @@ def whole_number(what: str, value: Any, least: int) -> int:
         if number == value and number >= least and not isinstance(value, (bool, np.bool_)):
             return number
     raise WarpLcpError(f"{what} is {value!r}; give a whole number of at least {least}")
+
+
+def positive_number(what: str, value: Any, unit: str = "", error: type[WarpLcpError] = WarpLcpError) -> float:
+    """A quantity that a user gives, as a float: finite and greater than zero; text is none.
+
+    Raises:
+        error: for anything else.
+    """
+    with suppress(TypeError, ValueError):
+        if not isinstance(value, (str, bool, np.bool_)) and np.isfinite(value) and value > 0.0:
+            return float(value)
+    shown = f"{value!r}" if isinstance(value, str) else f"{value} {unit}".strip()
+    raise error(f"{what} is {shown}; it must be finite and greater than zero")

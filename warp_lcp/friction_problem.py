@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from .arrays import check_finite, check_strides, device_of, is_single, on_device, read
-from .errors import WarpLcpError, whole_number
+from .errors import WarpLcpError, positive_number, whole_number
 from .kernels import contact_problem
 from .kernels.types import LANES
 from .methods import contact_workspace, workspaces
@@ -119,10 +119,9 @@ def prepare(
         W, q = W.reshape((1, *W.shape)), q.reshape((1, *q.shape))
     batch, contacts = q.shape[0], q.shape[1] // 3
     mu = _coefficients(mu, batch, contacts, real, device)
-    if tolerance is not None and not tolerance > 0.0:
-        raise WarpLcpError(f"{me}: tolerance is {tolerance}; it must be greater than zero")
     if tolerance is None:
         tolerance = 1e-10 if real is wp.float64 else 1e-4
+    tolerance = positive_number(f"{me}: tolerance", tolerance)
     code = {"coulomb": 1, "phantom_inertia": directions, "anitescu_potra": -directions}[formulation]
     blocks = contacts * (contacts - 1)
     slots = workspaces(batch, 20 * blocks, device)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from .errors import SimulationError, WarpLcpError, whole_number
+from .errors import SimulationError, WarpLcpError, positive_number, whole_number
 from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset, restitution
 from .kernels.types import scalar_types
 from .laws import Law
@@ -137,14 +137,10 @@ class Simulator:
         _choice("method", method, tuple(METHODS))
         _choice("precision", precision, tuple(PRECISIONS))
         _choice("integrator", integrator, INTEGRATORS)
-        if not (np.isfinite(dt) and dt > 0.0):
-            raise WarpLcpError(f"dt is {dt} s; it must be finite and greater than zero")
-        if not (np.isfinite(rho_scale) and rho_scale > 0.0):
-            raise WarpLcpError(f"rho_scale is {rho_scale}; it must be finite and greater than zero")
-        self.model, self.num_envs, self.dt = model, whole_number("num_envs", num_envs, 1), float(dt)
+        self.model, self.num_envs, self.dt = model, whole_number("num_envs", num_envs, 1), positive_number("dt", dt, "s")
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
-        self.directions, self.rho_scale, self.strict = self.law.directions, float(rho_scale), bool(strict)
+        self.directions, self.rho_scale, self.strict = self.law.directions, positive_number("rho_scale", rho_scale), bool(strict)
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
         self.tolerance = TOLERANCE

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from .arrays import check_finite, check_strides, device_of, is_single, on_device, read
-from .errors import WarpLcpError
+from .errors import WarpLcpError, positive_number
 from .kernels import solve_batch
 from .kernels.types import LANES
 from .methods import lcp_workspace, workspaces
@@ -82,8 +82,7 @@ def solve_lcp(
     """
     if method not in METHODS:
         raise WarpLcpError(f"solve_lcp: method is {method!r}; choose one of {', '.join(METHODS)}")
-    if not tolerance > 0.0:
-        raise WarpLcpError(f"solve_lcp: tolerance is {tolerance}; it must be greater than zero")
+    tolerance = positive_number("solve_lcp: tolerance", tolerance)
     M, q = read("solve_lcp", "M", M), read("solve_lcp", "q", q)
     if M.ndim not in (2, 3) or M.ndim != q.ndim + 1 or M.shape != (*q.shape, q.shape[-1]):
         raise WarpLcpError(f"solve_lcp: M has shape {tuple(M.shape)} and q {tuple(q.shape)}; give [B, n, n] and [B, n], or [n, n] and [n]")
