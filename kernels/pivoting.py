@@ -167,48 +167,35 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
     @wp.func
     def operator(frame: mat33, eps: vec3, free: vec3, mu: vec2, bound: vec2, k: int, state: int, slip: vec3):
         """K [kg] and g [N s], world axes, of a contact in its state: p = -(K J x + g)."""
-        n = frame[0]
         matrix = mat33()
         shift = vec3()
-        column = n
-        t1 = frame[1]
-        t2 = frame[2]
-        f1 = free[1]
-        f2 = free[2]
-        e2 = eps[2]
+        column = frame[0]
+        axes = frame
+        f = free
+        e = eps
         if wp.static(cone):  # noqa: SIM102
             if axis_state(state, 0) != AXIS_STICKS:  # axes along and across the slip
-                t1 = slip[0] * frame[1] + slip[1] * frame[2]
-                t2 = wp.cross(n, t1)
-                f1 = slip[0] * free[1] + slip[1] * free[2]
-                f2 = slip[0] * free[2] - slip[1] * free[1]
-                e2 = slip[2]
+                along = slip[0] * frame[1] + slip[1] * frame[2]
+                axes = wp.matrix_from_rows(frame[0], along, wp.cross(frame[0], along))
+                f = vec3(free[0], slip[0] * free[1] + slip[1] * free[2], slip[0] * free[2] - slip[1] * free[1])
+                e[2] = slip[2]
         if has_friction(state, bound, k):
-            if axis_state(state, 0) == AXIS_STICKS:
-                scaled = t1 * (real(1.0) / eps[1])
-                matrix += wp.outer(scaled, t1)
-                shift += scaled * f1
-            else:
-                sign = real(1.0)
-                if axis_state(state, 0) == AXIS_SLIDES_UP:
-                    sign = real(-1.0)
-                column += (sign * mu[0]) * t1
-                if wp.static(frozen):
-                    shift -= (sign * bound[0]) * t1
-            if axis_state(state, 1) == AXIS_STICKS:
-                scaled = t2 * (real(1.0) / e2)
-                matrix += wp.outer(scaled, t2)
-                shift += scaled * f2
-            else:
-                sign = real(1.0)
-                if axis_state(state, 1) == AXIS_SLIDES_UP:
-                    sign = real(-1.0)
-                column += (sign * mu[1]) * t2
-                if wp.static(frozen):
-                    shift -= (sign * bound[1]) * t2
+            for axis in range(2):
+                t = axes[1 + axis]
+                if axis_state(state, axis) == AXIS_STICKS:
+                    scaled = t * (real(1.0) / e[1 + axis])
+                    matrix += wp.outer(scaled, t)
+                    shift += scaled * f[1 + axis]
+                else:
+                    sign = real(1.0)
+                    if axis_state(state, axis) == AXIS_SLIDES_UP:
+                        sign = real(-1.0)
+                    column += (sign * mu[axis]) * t
+                    if wp.static(frozen):
+                        shift -= (sign * bound[axis]) * t
         if (state & CLOSED) != 0:
             column = column * (real(1.0) / eps[0])
-            matrix += wp.outer(column, n)
+            matrix += wp.outer(column, frame[0])
             shift += column * free[0]
         return matrix, shift
 

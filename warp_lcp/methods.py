@@ -6,6 +6,7 @@ A new method is a :class:`Method`, entered in METHODS.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -88,7 +89,7 @@ def workspaces(num_envs: int, scalars: int, device: wp.Device) -> int:
     return 1 if device.is_cpu else max(1, min(num_envs, GPU_WORKSPACES, GPU_WORKSPACE_BYTES // (8 * max(scalars, 1))))
 
 
-class Method:
+class Method(ABC):
     """``kernel`` (chosen for a model), ``prepare`` (allocate, once) and ``launch`` (record, no host read-back).
 
     Attributes:
@@ -100,15 +101,17 @@ class Method:
     makes_rows = False
     judges = False
 
+    def take_rows(self) -> None:
+        """From now on the kernel solves rows that are there: others made them, changed them (kernels/restitution.py) or tried them."""
+        self.makes_rows = False
+
+    @abstractmethod
     def prepare(self, sim: Simulator) -> None:
         """Allocate what the kernel needs."""
 
-    def take_rows(self) -> None:
-        """From now on the kernel solves rows that are there: others made them, changed them (kernels/restitution.py) or tried them."""
-
+    @abstractmethod
     def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
         """The environments todo[:number] that are listed on the device."""
-        raise NotImplementedError
 
 
 class AssembledLCP(Method):
@@ -183,8 +186,8 @@ class VelocityPivoting(Method):
             self.take_rows()
 
     def take_rows(self) -> None:
-        if self.makes_rows:
-            self.makes_rows = False
+        super().take_rows()
+        if self.parts is None:
             self.kernel = single.make(*self.kind, self.makes_rows)
 
     def prepare(self, sim: Simulator) -> None:
@@ -237,6 +240,9 @@ class BlockPGS(Method):
 
     def __init__(self, model: Model, real: Any, law: Law):
         self.kernel = pgs.make(real)
+
+    def prepare(self, sim: Simulator) -> None:
+        """Nothing to allocate: the velocities are the simulator's."""
 
     def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
         # Sweeps end where no impulse changes a velocity by more than a hundredth of what certifies an answer.
