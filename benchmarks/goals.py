@@ -18,7 +18,7 @@ import warp as wp
 
 import warp_lcp as wl
 
-from .scenes import GRAVITY, STATES, STEPS, Scene, scene
+from .scenes import GRAVITY, STATES, STEPS, Scene, boxes, scene
 
 RATIOS = (1e3, 1e6)
 MASS, HALF, DT, STEPS_HEAVY = 8.0, 0.1, 5e-3, 400
@@ -35,8 +35,8 @@ def heavy_on_light(ratio: float) -> Scene:
     """The stack at rest."""
     pose = np.zeros((1, 2, 7))
     pose[..., 2], pose[..., 6] = HALF * np.array([1.0, 3.0]), 1.0
-    mass = MASS * np.array([1.0, ratio])
-    return Scene("heavy_on_light", DT, STEPS_HEAVY, 0.5, np.full((2, 3), HALF), mass, pose, np.zeros((1, 2, 6)))
+    mass = [MASS, MASS * ratio]
+    return boxes("heavy_on_light", np.full((2, 3), HALF), mass, pose, np.zeros((1, 2, 6)), 0.5, dt=DT, steps=STEPS_HEAVY)
 
 
 def mass_ratio(quick: bool) -> list[dict[str, Any]]:

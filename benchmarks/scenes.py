@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes of the comparisons: boxes on the plane z = 0, described once for warp_lcp and for the peers alike."""
+"""Scenes of the benchmarks, described once for warp_lcp and for other engines alike."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,58 +17,155 @@ GRAVITY = 9.81
 STATES = ("rest", "slide", "tumble")
 STEPS = {"rest": 50, "slide": 50, "tumble": 250, "pile5": 600, "stack10": 200}
 ENVS = {"rest": 1024, "slide": 1024, "tumble": 1024, "pile5": 64, "stack10": 16}
+KINDS = ("plane", "box", "sphere", "capsule")
+WORLD = -1
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A collider.
+
+    Attributes:
+        kind: one of KINDS.
+        body: index of the body it belongs to, or WORLD.
+        size: [m] half extents of a box; (radius, 0, 0) of a sphere; (radius, half length of the straight part, 0) of a
+            capsule, whose axis is z; unused for a plane, whose normal is z.
+        pose: in its body, x y z qx qy qz qw.
+    """
+
+    kind: str
+    body: int
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pose: tuple[float, ...] = IDENTITY
+
+
+GROUND = Shape("plane", WORLD)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """E environments of B boxes on the plane z = 0, the same boxes in each.
+    """E environments of the same B free bodies and of colliders that belong to them or to the world.
 
     Attributes:
         name: for tables.
-        dt: step [s]. steps: number of steps, even.
-        friction: coefficient of every contact, static and dynamic.
-        half: [B, 3] half extents [m]. mass: [B] kg, uniform density.
+        dt: step [s]. steps: number of steps.
+        friction: coefficient of every contact, static and dynamic. restitution: Newton's, of every contact.
+        shapes: the colliders.
+        mass: [B] kg. inertia: [B, 3] kg m^2, principal, about the centre of mass, which is the body's origin, in its axes.
         pose: [E, B, 7] start, x y z qx qy qz qw. velocity: [E, B, 6] start, linear then angular, world axes.
+        gravity: [3] m/s^2.
+        wrench: [B, 6] constant force [N] at the centre of mass and torque [N m], world axes; None: none.
     """
 
     name: str
     dt: float
     steps: int
     friction: float
-    half: np.ndarray
+    shapes: tuple[Shape, ...]
     mass: np.ndarray
+    inertia: np.ndarray
     pose: np.ndarray
     velocity: np.ndarray
+    gravity: tuple[float, float, float] = (0.0, 0.0, -GRAVITY)
+    wrench: np.ndarray | None = None
+    restitution: float = 0.0
 
     @property
     def envs(self) -> int:
         """Number of environments."""
         return len(self.pose)
 
-    def model(self) -> wl.Model:
-        """The boxes as environment 0 has them."""
-        builder, material = wl.ModelBuilder(gravity=(0, 0, -GRAVITY)), wl.Material(self.friction, self.friction)
-        builder.add_plane(material=material)
-        for half, mass, pose, velocity in zip(self.half, self.mass, self.pose[0], self.velocity[0], strict=True):
-            body = builder.add_body(pose=pose, velocity=velocity[:3], angular_velocity=velocity[3:], mass=mass)
-            builder.add_box(body, half, material=material)
+    def copies(self, envs: int) -> Scene:
+        """The scene with so many environments: those there are, over and over."""
+        index = np.arange(envs) % self.envs
+        return replace(self, pose=self.pose[index], velocity=self.velocity[index])
+
+    def model(self, **material: Any) -> wl.Model:
+        """The scene as environment 0 has it; `material` are further arguments of every contact's wl.Material."""
+        builder = wl.ModelBuilder(gravity=self.gravity)
+        surface = wl.Material(self.friction, self.friction, restitution=self.restitution, **material)
+        for mass, inertia, pose, velocity in zip(self.mass, self.inertia, self.pose[0], self.velocity[0], strict=True):
+            builder.add_body(
+                pose=pose, velocity=velocity[:3], angular_velocity=velocity[3:], mass=mass, inertia=np.diag(inertia), com=(0.0, 0.0, 0.0)
+            )
+        for shape in self.shapes:
+            where = {"body": shape.body, "pose": shape.pose, "material": surface}
+            if shape.kind == "plane":
+                builder.add_plane(**where)
+            elif shape.kind == "box":
+                builder.add_box(half_extents=shape.size, **where)
+            elif shape.kind == "sphere":
+                builder.add_sphere(radius=shape.size[0], **where)
+            else:
+                builder.add_capsule(radius=shape.size[0], half_length=shape.size[1], **where)
         return builder.finalize()
 
-    def simulator(self, dt: float | None = None, **options: Any) -> wl.Simulator:
+    def simulator(self, dt: float | None = None, material: dict[str, Any] | None = None, **options: Any) -> wl.Simulator:
         """A Simulator of the scene, every environment at its start; dt of the scene unless given."""
-        sim = wl.Simulator(self.model(), self.envs, self.dt if dt is None else dt, **options)
+        sim = wl.Simulator(self.model(**material or {}), self.envs, self.dt if dt is None else dt, **options)
         sim.q0.assign(self.pose.reshape(self.envs, -1))
         sim.v0.assign(self.velocity.reshape(self.envs, -1))
+        if self.wrench is not None:
+            sim.wrench.assign(np.tile(self.wrench, (self.envs, 1, 1)))
         sim.reset()
         return sim
 
     def save(self, path: Path) -> None:
-        """What an adapter reads: half extents, masses and the start of every environment."""
-        np.savez(path, half=self.half, mass=self.mass, pose=self.pose, velocity=self.velocity)
+        """What an adapter reads: the arrays of this class, and the colliders as shape_kind, shape_body, shape_size, shape_pose."""
+        np.savez(
+            path,
+            shape_kind=np.array([shape.kind for shape in self.shapes]),
+            shape_body=np.array([shape.body for shape in self.shapes]),
+            shape_size=np.array([shape.size for shape in self.shapes]),
+            shape_pose=np.array([shape.pose for shape in self.shapes]),
+            mass=self.mass,
+            inertia=self.inertia,
+            pose=self.pose,
+            velocity=self.velocity,
+            gravity=np.array(self.gravity),
+            wrench=np.zeros((len(self.mass), 6)) if self.wrench is None else self.wrench,
+        )
+
+
+# ------------------------------------------------------------------------------------------------------------- solid bodies
+
+
+def box_inertia(half: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Of solid boxes [B, 3] with half extents [B, 3] and masses [B]."""
+    square = np.asarray(half) ** 2
+    return np.asarray(mass)[:, None] * (square.sum(axis=1)[:, None] - square) / 3.0
+
+
+def ball_inertia(radius: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Of solid spheres [B, 3] with radii [B] and masses [B]."""
+    return np.repeat((0.4 * np.asarray(mass) * np.asarray(radius) ** 2)[:, None], 3, axis=1)
+
+
+def boxes(
+    name: str,
+    half: Sequence[Sequence[float]],
+    mass: Sequence[float],
+    pose: np.ndarray,
+    velocity: np.ndarray,
+    friction: float,
+    dt: float = DT,
+    steps: int = 0,
+    statics: tuple[Shape, ...] = (GROUND,),
+    **options: Any,
+) -> Scene:
+    """Solid boxes, one a body, and colliders of the world."""
+    sizes = [(float(x), float(y), float(z)) for x, y, z in half]
+    shapes = statics + tuple(Shape("box", i, size) for i, size in enumerate(sizes))
+    masses = np.asarray(mass, dtype=float)
+    return Scene(name, dt, steps, friction, shapes, masses, box_inertia(np.asarray(half), masses), pose, velocity, **options)
+
+
+# ------------------------------------------------------------------------------------------------------- scenes of `speed`
 
 
 def scene(name: str, envs: int | None = None) -> Scene:
-    """A scene by its name, with its usual number of environments unless given."""
+    """A scene of the speed benchmark by its name, with its usual number of environments unless given."""
     envs = ENVS[name] if envs is None else envs
     if name in STATES:
         half, mass, friction = np.full((1, 3), 0.5), np.ones(1), 1.0
@@ -81,9 +179,7 @@ def scene(name: str, envs: int | None = None) -> Scene:
         pose[..., 2], pose[..., 6] = 0.5 + np.arange(10), 1.0
     else:
         raise ValueError(f"no scene {name!r}; choose from {', '.join(STEPS)}")
-    return Scene(name, DT, STEPS[name], friction, half, mass, pose, velocity)
-
-
+    return boxes(name, half, mass, pose, velocity, friction, steps=STEPS[name])
 def paper_box(state: str, envs: int) -> tuple[np.ndarray, np.ndarray]:
     """Pose and velocity of the paper's box (Table 1): at rest, sliding as in its example, or dropped tumbling at random."""
     rng = np.random.default_rng(0)

@@ -23,13 +23,15 @@ class Peer:
     """Another engine.
 
     Attributes:
-        name: of its folder and its adapter, adapters/on_<name>.py.
+        name: in tables, and of its adapter, adapters/on_<name>.py.
+        interpreter: folder of its interpreter; peers that need the same share it.
         requirements: what pip installs into its interpreter, versions pinned.
         variants: settings worth comparing, by the name they have in tables; the adapter reads the settings.
         adapter: the script, if it is elsewhere.
     """
 
     name: str
+    interpreter: str
     requirements: tuple[str, ...]
     variants: dict[str, dict[str, Any]]
     adapter: Path = field(default=Path())
@@ -40,11 +42,11 @@ class Peer:
 
     def python(self, folder: Path) -> Path:
         """Its interpreter."""
-        return folder / self.name / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+        return folder / self.interpreter / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
     def marker(self, folder: Path) -> Path:
         """Written when everything is installed, with the requirements in it."""
-        return folder / self.name / "installed.txt"
+        return folder / self.interpreter / "installed.txt"
 
     def installed(self, folder: Path) -> bool:
         """Whether its interpreter is there, complete and with the versions asked for."""
@@ -52,9 +54,11 @@ class Peer:
         return self.python(folder).exists() and marker.exists() and marker.read_text().split() == list(self.requirements)
 
     def install(self, folder: Path) -> None:
-        """Make its interpreter, with Python's venv and pip as they are configured on this machine."""
+        """Make its interpreter, unless it is there, with Python's venv and pip as they are configured on this machine."""
+        if self.installed(folder):
+            return
         self.marker(folder).unlink(missing_ok=True)
-        subprocess.run([sys.executable, "-m", "venv", str(folder / self.name)], check=True)
+        subprocess.run([sys.executable, "-m", "venv", str(folder / self.interpreter)], check=True)
         subprocess.run([str(self.python(folder)), "-m", "pip", "install", "-q", *self.requirements], check=True)
         self.marker(folder).write_text("\n".join(self.requirements) + "\n")
 
@@ -62,16 +66,17 @@ class Peer:
         """Variables of its process: one thread, a kernel cache of its own, nothing of our interpreter."""
         ours = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
         threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
-        return ours | threads | {"WARP_CACHE_PATH": str(folder / self.name / "warp_cache")}
+        return ours | threads | {"WARP_CACHE_PATH": str(folder / self.interpreter / "warp_cache")}
 
 
-# MuJoCo's default contact, a spring with a time constant of 20 ms, and the stiffest that MuJoCo allows at a step of 1 ms,
-# two steps. XPBD's default are 2 iterations.
+# MuJoCo's default contact is a spring with a time constant of 20 ms; the stiffest that it allows has two steps.
 STIFF = "0.002 1"
+NEWTON = ("newton==1.8.0", "warp-lang==1.19.0")
 PEERS = {
     peer.name: peer
     for peer in (
         Peer(
+            "mujoco",
             "mujoco",
             ("mujoco==4.0.0",),
             {
@@ -82,14 +87,11 @@ PEERS = {
         ),
         Peer(
             "mujoco_warp",
+            "mujoco_warp",
             ("mujoco-warp==4.0.0", "mujoco==4.0.0", "warp-lang==1.19.0"),
             {"pyramidal": {"cone": "pyramidal"}, "elliptic": {"cone": "elliptic"}},
         ),
-        Peer(
-            "newton_xpbd",
-            ("newton==1.8.0", "warp-lang==1.19.0"),
-            {f"{n} iterations": {"iterations": n} for n in (2, 10, 20)},
-        ),
+        Peer("newton_xpbd", "newton", NEWTON, {f"{n} iterations": {"iterations": n} for n in (2, 10, 20)}),
     )
 }
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A peer's process doing one job, one repetition at a time, so that all engines take turns in the same minutes."""
+"""A peer's process, which simulates one scene after another, a repetition at a time, so that all engines can take turns."""
 
 from __future__ import annotations
 
@@ -9,93 +9,121 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..scenes import GRAVITY, Scene
+from ..scenes import Scene
 from . import Peer
 
 
 class PeerError(RuntimeError):
-    """An adapter ended early; the message holds the end of what it printed."""
+    """An adapter failed; the message holds the end of what it printed."""
+
+
+class Refused(RuntimeError):
+    """A peer cannot do a job; the message is its own."""
 
 
 @dataclass
-class Session:
-    """One running adapter.
+class Task:
+    """One scene with one variant's settings in a peer's process, simulated once.
 
     Attributes:
-        peer, variant: what runs.
-        answer: the adapter's result, once finish() was called.
-        arrays: the arrays it wrote, see adapters/protocol.py.
+        pose, velocity: [T, E, B, 7], [T, E, B, 6] at the start and after every `every` steps.
+        contacts: mean number in an environment and a step.
+        info: of the last run: what the engine allocated, and whether that was enough ('overflow').
+        same: whether all timed runs ended where the first one did.
     """
 
-    peer: Peer
+    session: Session
     variant: str
-    process: subprocess.Popen[str]
-    log: Path
-    answer: dict[str, Any] = field(default_factory=dict)
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    id: int
+    pose: np.ndarray
+    velocity: np.ndarray
+    contacts: float
+    info: dict[str, Any]
+    same: bool = True
+    seconds: list[float] = field(default_factory=list)
 
     @property
     def name(self) -> str:
         """As tables show it."""
-        return f"{self.peer.name}, {self.variant}"
+        return f"{self.session.peer.name}, {self.variant}"
 
-    def reply(self) -> str:
+    def repeat(self) -> float:
+        """All steps once more, timed [s]."""
+        reply = self.session.order({"do": "run", "id": self.id}, self.variant)
+        self.seconds.append(reply["seconds"])
+        self.same &= reply["same"]
+        self.info = reply["info"]
+        return self.seconds[-1]
+
+    def drop(self) -> None:
+        """Free its memory in the peer's process."""
+        self.session.order({"do": "drop", "id": self.id}, self.variant)
+
+
+@dataclass
+class Session:
+    """A running adapter.
+
+    Attributes:
+        versions: of the packages that matter.
+    """
+
+    peer: Peer
+    process: subprocess.Popen[str]
+    work: Path
+    versions: dict[str, str] = field(default_factory=dict)
+    ids: Iterator[int] = field(default_factory=count)
+
+    def reply(self, what: str) -> dict[str, Any]:
         """The adapter's next line."""
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
-            tail = "\n".join(self.log.read_text(errors="replace").splitlines()[-20:])
-            raise PeerError(f"{self.name}: the adapter ended with status {self.process.wait()}:\n{tail}")
-        return line.strip()
+            tail = "\n".join((self.work / "log.txt").read_text(errors="replace").splitlines()[-20:])
+            raise PeerError(f"{self.peer.name}, {what}: the adapter ended with status {self.process.wait()}:\n{tail}")
+        return json.loads(line)
 
-    def expect_ready(self) -> None:
-        """Wait until the adapter is set up, or done with its last repetition and ready for another."""
-        if (line := self.reply()) != "ready":
-            raise PeerError(f"{self.name}: the adapter said {line!r} instead of 'ready'")
-
-    def go_on(self) -> None:
-        """Let the adapter do what it is ready for."""
+    def order(self, order: dict[str, Any], what: str) -> dict[str, Any]:
+        """Send an order and wait for the reply to it."""
         assert self.process.stdin is not None
-        self.process.stdin.write("\n")
-        self.process.stdin.flush()
+        try:
+            self.process.stdin.write(json.dumps(order) + "\n")
+            self.process.stdin.flush()
+        except BrokenPipeError:
+            pass  # reply() says what became of the adapter
+        reply = self.reply(what)
+        if "refused" in reply:
+            raise Refused(f"{self.peer.name}, {what}: {reply['refused']}")
+        if "error" in reply:
+            raise PeerError(f"{self.peer.name}, {what}: {reply['error']}")
+        return reply
 
-    def repeat(self) -> None:
-        """One repetition, from beginning to end."""
-        self.go_on()
-        self.expect_ready()
-
-    def finish(self) -> None:
-        """Read the result, after the last repetition of everyone: an adapter that ends takes the core from the others."""
-        self.go_on()
-        self.answer = json.loads(self.reply())
-        with np.load(self.answer["result"]) as arrays:
-            self.arrays = dict(arrays)
+    def make(self, variant: str, scene: Scene, every: int = 1) -> Task:
+        """Let the peer simulate a scene once, not timed, with a sample after every so many steps."""
+        index = next(self.ids)
+        state, result = self.work / f"state{index}.npz", self.work / f"result{index}.npz"
+        scene.save(state)
+        job = {name: getattr(scene, name) for name in ("dt", "steps", "friction", "restitution")}
+        job |= {"scene": scene.name, "every": every, "settings": self.peer.variants[variant], "state": str(state), "result": str(result)}
+        reply = self.order({"do": "make", "id": index, "job": job}, variant)
+        with np.load(result) as arrays:
+            task = Task(self, variant, index, arrays["pose"], arrays["velocity"], float(arrays["contacts"]), reply["info"])
+        result.unlink()
+        state.unlink()
+        return task
 
 
 @contextmanager
-def session(peer: Peer, variant: str, scene: Scene, repetitions: int, folder: Path) -> Iterator[Session]:
-    """Start an adapter and wait until it is set up and warm; its process ends with the context."""
+def session(peer: Peer, folder: Path) -> Iterator[Session]:
+    """Start a peer's adapter; its process ends with the context."""
     with tempfile.TemporaryDirectory() as work:
-        state, log = Path(work, "state.npz"), Path(work, "log.txt")
-        scene.save(state)
-        job = {
-            "scene": scene.name,
-            "envs": scene.envs,
-            "dt": scene.dt,
-            "steps": scene.steps,
-            "friction": scene.friction,
-            "gravity": GRAVITY,
-            "state": str(state),
-            "settings": peer.variants[variant],
-            "repetitions": repetitions,
-            "result": str(Path(work, "result.npz")),
-        }
-        with log.open("w") as errors:
+        with Path(work, "log.txt").open("w") as errors:
             process = subprocess.Popen(
                 [str(peer.python(folder)), str(peer.adapter)],
                 stdin=subprocess.PIPE,
@@ -104,13 +132,10 @@ def session(peer: Peer, variant: str, scene: Scene, repetitions: int, folder: Pa
                 text=True,
                 env=peer.environment(folder),
             )
-            try:
-                assert process.stdin is not None
-                process.stdin.write(json.dumps(job) + "\n")
-                process.stdin.flush()
-                running = Session(peer, variant, process, log)
-                running.expect_ready()
-                yield running
-            finally:
-                process.kill()
-                process.communicate()
+        try:
+            running = Session(peer, process, Path(work))
+            running.versions = running.reply("start")["versions"]
+            yield running
+        finally:
+            process.kill()
+            process.communicate()

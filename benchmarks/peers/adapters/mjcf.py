@@ -4,19 +4,35 @@
 from __future__ import annotations
 
 import numpy as np
-from protocol import Job
+from protocol import Job, Refused
+
+#: Settings that are attributes of <option>.
+OPTIONS = ("cone", "impratio", "iterations", "tolerance", "noslip_iterations", "noslip_tolerance", "solver")
+
+
+def numbers(values: np.ndarray) -> str:
+    """For an XML attribute, without loss."""
+    return " ".join(repr(float(value)) for value in values)
 
 
 def model(job: Job) -> str:
-    """MJCF of one environment. Settings: cone, solref (empty: MuJoCo's default)."""
-    geom = f'condim="3" friction="{job.friction} 0.005 0.0001"' + (f' solref="{s}"' if (s := job.settings.get("solref")) else "")
+    """MJCF of one environment. Settings: those of OPTIONS, and solref of every contact (absent: MuJoCo's default)."""
+    if job.restitution:
+        raise Refused("MuJoCo has no coefficient of restitution")
+    surface = f'condim="3" friction="{job.friction} 0.005 0.0001"' + (f' solref="{s}"' if (s := job.settings.get("solref")) else "")
+    geoms: dict[int, str] = {body: "" for body in range(-1, len(job.mass))}
+    for kind, body, size, pose in zip(job.shape_kind, job.shape_body, job.shape_size, job.shape_pose, strict=True):
+        extent = {"plane": "0 0 1", "box": numbers(size), "sphere": numbers(size[:1]), "capsule": numbers(size[:2])}[kind]
+        place = f'pos="{numbers(pose[:3])}" quat="{numbers(np.roll(pose[3:], 1))}"'
+        geoms[body] += f'<geom type="{kind}" size="{extent}" {place} {surface}/>'
     bodies = "".join(
-        f'<body><freejoint/><geom type="box" size="{" ".join(map(str, half))}" mass="{mass}" {geom}/></body>'
-        for half, mass in zip(job.half.tolist(), job.mass.tolist(), strict=True)
+        f'<body><freejoint/><inertial pos="0 0 0" mass="{mass!r}" diaginertia="{numbers(inertia)}"/>{geoms[body]}</body>'
+        for body, (mass, inertia) in enumerate(zip(job.mass.tolist(), job.inertia, strict=True))
     )
+    options = " ".join(f'{key}="{job.settings[key]}"' for key in OPTIONS if key in job.settings)
     return (
-        f'<mujoco><option timestep="{job.dt}" gravity="0 0 {-job.gravity}" cone="{job.settings["cone"]}"/>'
-        f'<worldbody><geom type="plane" size="0 0 1" {geom}/>{bodies}</worldbody></mujoco>'
+        f'<mujoco><option timestep="{job.dt}" gravity="{numbers(job.gravity)}" {options}/>'
+        f"<worldbody>{geoms[-1]}{bodies}</worldbody></mujoco>"
     )
 
 
@@ -35,7 +51,7 @@ def to_mujoco(pose: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def from_mujoco(qpos: np.ndarray, qvel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose [E, B, 7] and velocity [E, B, 6] of to_mujoco's arguments."""
-    qpos, qvel = qpos.reshape(len(qpos), -1, 7), qvel.reshape(len(qvel), -1, 6)
+    """Pose [..., B, 7] and velocity [..., B, 6] of arrays like to_mujoco's, [..., 7 B] and [..., 6 B]."""
+    qpos, qvel = qpos.reshape(*qpos.shape[:-1], -1, 7), qvel.reshape(*qvel.shape[:-1], -1, 6)
     pose = np.concatenate([qpos[..., :3], qpos[..., 4:], qpos[..., 3:4]], axis=-1)
     return pose, np.concatenate([qvel[..., :3], rotate(pose[..., 3:], qvel[..., 3:])], axis=-1)

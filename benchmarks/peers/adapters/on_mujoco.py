@@ -11,46 +11,60 @@ import numpy as np
 import protocol
 from mujoco import rollout
 
-SAMPLES = 4000  # states of the trajectories in which contacts are counted
+COUNTED = 4000  # states of the trajectories in which contacts are counted
+FULL, APPLIED = mujoco.mjtState.mjSTATE_FULLPHYSICS, mujoco.mjtState.mjSTATE_XFRC_APPLIED
 
 
-class MuJoCo:
+class MuJoCo(protocol.Engine):
     """One MjModel and MjData; the environments go through it one after another."""
 
     def __init__(self, job: protocol.Job):
         self.job = job
         self.model = mujoco.MjModel.from_xml_string(mjcf.model(job))
         self.data = mujoco.MjData(self.model)
-        size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        size = mujoco.mj_stateSize(self.model, FULL)
         assert size == 1 + self.model.nq + self.model.nv, "a state is time, qpos, qvel"
         self.start = np.concatenate([np.zeros((job.envs, 1)), *mjcf.to_mujoco(job.pose, job.velocity)], axis=1)
-        self.states = np.zeros((job.envs, job.steps, size))
         self.pool = rollout.Rollout(nthread=0)
+        self.control: dict[str, Any] = {}
+        if job.wrench.any():
+            applied = np.concatenate([np.zeros(6), job.wrench.ravel()])  # the world first
+            self.control = {"control": np.tile(applied, (1, job.steps, 1)), "control_spec": int(APPLIED)}
         self.reset()
 
     def reset(self) -> None:
         """A rollout starts from self.start and clears the warm start itself."""
         self.last = self.start
 
-    def run(self) -> None:
+    def run(self, steps: int) -> None:
         """All steps of all environments in one call."""
-        self.pool.rollout(self.model, [self.data], self.start, nstep=self.job.steps, state=self.states)
+        assert steps == self.job.steps, "a rollout forgets the warm start of the one before"
+        self.states, _ = self.pool.rollout(self.model, [self.data], self.start, nstep=steps, **self.control)
         self.last = self.states[:, -1]
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """The last state of the trajectories."""
-        return mjcf.from_mujoco(self.last[:, 1 : 1 + self.model.nq], self.last[:, 1 + self.model.nq :])
+        return self.unpacked(self.last)
+
+    def unpacked(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of states [..., 1 + nq + nv]."""
+        return mjcf.from_mujoco(states[..., 1 : 1 + self.model.nq], states[..., 1 + self.model.nq :])
+
+    def contacts(self) -> float:
+        """Counted in some of the states of the trajectories."""
+        flat, found = self.states.reshape(-1, self.states.shape[-1]), []
+        for state in flat[:: max(1, len(flat) // COUNTED)]:
+            mujoco.mj_setState(self.model, self.data, state, FULL)
+            mujoco.mj_fwdPosition(self.model, self.data)
+            found.append(self.data.ncon)
+        return float(np.mean(found))
 
     def record(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """The trajectories hold the heights; contacts are counted in some of their states."""
-        self.run()
-        flat = self.states.reshape(-1, self.states.shape[-1])
-        contacts = []
-        for state in flat[:: max(1, len(flat) // SAMPLES)]:
-            mujoco.mj_setState(self.model, self.data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-            mujoco.mj_fwdPosition(self.model, self.data)
-            contacts.append(self.data.ncon)
-        return self.state()[0], self.states[:, :, 3 : 1 + self.model.nq : 7].max(axis=1), float(np.mean(contacts))
+        """The trajectories hold every step."""
+        self.run(self.job.steps)
+        samples = np.concatenate([self.start[:, None], self.states[:, self.job.every - 1 :: self.job.every]], axis=1)
+        pose, velocity = self.unpacked(samples.swapaxes(0, 1))
+        return pose, velocity, self.contacts()
 
     def info(self) -> dict[str, Any]:
         """Overflow: a rollout stops an environment's clock at any of MuJoCo's warnings (memory full, bad numbers)."""

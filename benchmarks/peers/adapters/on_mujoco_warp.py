@@ -16,15 +16,20 @@ GENEROUS = 16  # contacts for each body in the run that finds how many are neede
 BENIGN = mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS  # limits of the solver, not of the memory
 
 
-class MuJoCoWarp:
+class MuJoCoWarp(protocol.Engine):
     """Steps with just the contacts and rows that the scene takes; they are counted in an untimed run first."""
 
     def __init__(self, job: protocol.Job):
+        if "noslip_iterations" in job.settings and not hasattr(mjw.Option, "noslip_iterations"):
+            raise protocol.Refused("no noslip solver")
         wp.set_device("cpu")
         self.job, self.spec = job, mujoco.MjModel.from_xml_string(mjcf.model(job))
         self.model = mjw.put_model(self.spec)
         self.qpos, self.qvel = mjcf.to_mujoco(job.pose, job.velocity)
+        self.applied = np.zeros((job.envs, len(job.mass) + 1, 6))  # the world first
+        self.applied[:, 1:] = job.wrench
         bodies = len(job.mass)
+        self.candidates = self.rows = 0
         self.allocate(job.envs * bodies * GENEROUS, 4 * bodies * GENEROUS)
 
     def allocate(self, contacts: int, rows: int) -> None:
@@ -43,30 +48,29 @@ class MuJoCoWarp:
         mjw.reset_data(self.model, self.data)
         self.data.qpos.assign(self.qpos)
         self.data.qvel.assign(self.qvel)
+        self.data.xfrc_applied.assign(self.applied)
 
-    def run(self) -> None:
+    def run(self, steps: int) -> None:
         """The CPU's launches are synchronous."""
-        for _ in range(self.job.steps):
+        for _ in range(steps):
             wp.capture_launch(self.graph)
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Read back."""
         return mjcf.from_mujoco(self.data.qpos.numpy().astype(float), self.data.qvel.numpy().astype(float))
 
-    def record(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Counts contacts, candidates and rows and allocates anew what was needed at most."""
-        top, contacts, candidates, rows = np.array(-np.inf), [], 0, 0
-        for _ in range(self.job.steps):
-            wp.capture_launch(self.graph)
-            top = np.maximum(top, self.data.qpos.numpy()[:, 2::7])
-            contacts.append(int(self.data.nacon.numpy()[0]))
-            candidates = max(candidates, int(self.data.ncollision.numpy()[0]))  # pairs to look at share the contacts' memory
-            rows = max(rows, int(self.data.nefc.numpy().max()))
+    def contacts(self) -> float:
+        """Counts candidates and rows as well: pairs to look at share the contacts' memory."""
+        contacts = int(self.data.nacon.numpy()[0])
+        self.candidates = max(self.candidates, contacts, int(self.data.ncollision.numpy()[0]))
+        self.rows = max(self.rows, int(self.data.nefc.numpy().max()))
+        return contacts / self.job.envs
+
+    def settle(self) -> None:
+        """Just what was needed at most."""
         if self.info()["overflow"]:
             raise RuntimeError(f"{self.capacity} are too few for {self.job.scene}: raise GENEROUS")
-        pose = self.state()[0]
-        self.allocate(max(candidates, *contacts), rows)
-        return pose, top, float(np.mean(contacts)) / self.job.envs
+        self.allocate(max(self.candidates, 1), max(self.rows, 1))
 
     def info(self) -> dict[str, Any]:
         """Overflow of memory in any environment since the reset, and how many ran into the solver's limits."""

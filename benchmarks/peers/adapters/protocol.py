@@ -1,102 +1,160 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every adapter shares: one JSON job in, one JSON result out. Runs in the peer's interpreter, so it needs numpy alone.
+"""What every adapter shares: orders on stdin, replies on stdout, a line of JSON each. Runs in the peer's interpreter, needs numpy alone.
 
-The job is the first line of stdin: scene, envs, dt, steps (even), friction, gravity, state (.npz: half [B, 3] m, mass [B] kg,
-pose [E, B, 7] x y z qx qy qz qw, velocity [E, B, 6] linear then angular in world axes), settings, repetitions, result (the
-.npz to write). Before each timed repetition, and before the result, the adapter says "ready" on stdout and waits for a line,
-so that the caller can take turns between several adapters and itself and none works, or ends, while another is timed; at the
-end of stdin nothing is waited for. The last line of stdout is {seconds: one a repetition, median, result, versions, info}.
-The engine's own prints go to stderr.
+Orders, each with the "id" of a job that the caller chooses:
 
-The .npz holds start_pose and start_velocity as the engine gives them back, pose and velocity after the last timed
-repetition, and of an untimed run of the same steps: recorded_pose at its end, top [E, B], the largest height of each
-body's centre after any step, and contacts, their mean number in an environment and a step.
+    {"do": "make", "id", "job": {scene, dt, steps, every, friction, restitution, settings, state, result}}
+        Build the engine and run the job once, not timed. `state` is the .npz that benchmarks.scenes.Scene.save writes. The
+        reply is {info}; the .npz `result` holds pose [T, E, B, 7] (x y z qx qy qz qw) and velocity [T, E, B, 6] (linear of the
+        centre of mass, then angular; world axes) at the start and after every `every` steps, as the engine gives them back, and
+        contacts, their mean number in an environment and a step.
+    {"do": "run", "id"}
+        All steps from the start, timed. The reply is {seconds, same, info}: same says whether it ended where the first run did.
+    {"do": "drop", "id"}
+        Forget the job.
+
+Several jobs may be there at a time, so that all engines can take turns. A reply {"refused": why} says that the engine cannot
+do the job, {"error": traceback} that it failed. The first line of stdout is {versions} of the packages that matter. The
+engine's own prints go to stderr.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import statistics
 import sys
 import time
+import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
+
+SHAPES = ("shape_kind", "shape_body", "shape_size", "shape_pose")
+BODIES = ("mass", "inertia", "pose", "velocity", "gravity", "wrench")
+
+
+class Refused(Exception):
+    """The engine has no way of doing the job; the message says what is missing."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One scene to simulate, see above."""
+    """One scene to simulate; the arrays are those of benchmarks.scenes.Scene, `every` the steps from sample to sample."""
 
     scene: str
-    envs: int
     dt: float
     steps: int
+    every: int
     friction: float
-    gravity: float
+    restitution: float
     settings: dict[str, Any]
-    half: np.ndarray
+    shape_kind: list[str]
+    shape_body: list[int]
+    shape_size: np.ndarray
+    shape_pose: np.ndarray
     mass: np.ndarray
+    inertia: np.ndarray
     pose: np.ndarray
     velocity: np.ndarray
+    gravity: np.ndarray
+    wrench: np.ndarray
+
+    @property
+    def envs(self) -> int:
+        """Number of environments."""
+        return len(self.pose)
 
 
-class Engine(Protocol):
-    """What an adapter implements. A state is (pose [E, B, 7], velocity [E, B, 6]) as in the job."""
+class Engine(ABC):
+    """What an adapter implements for one job. A state is (pose [E, B, 7], velocity [E, B, 6]) as in the job."""
 
+    job: Job
+
+    @abstractmethod
     def reset(self) -> None:
         """Back to the start, hidden state included."""
 
-    def run(self) -> None:
-        """The job's steps: what is timed."""
+    @abstractmethod
+    def run(self, steps: int) -> None:
+        """Advance by so many steps: what is timed."""
 
+    @abstractmethod
     def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """The present state."""
+        """The present state, in float64."""
 
-    def record(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Run from the start, not timed: (last pose, largest height of each body [E, B], mean contacts in an environment and a step)."""
+    @abstractmethod
+    def contacts(self) -> float:
+        """Number of contacts of the last step, mean over the environments. Called after every step of the untimed run."""
+
+    def settle(self) -> None:
+        """After the untimed run: allocate no more than what that one needed."""
 
     def info(self) -> dict[str, Any]:
-        """What was allocated and what went wrong; key 'overflow' must be false for the timings to count."""
+        """What was allocated and what went wrong since the reset; key 'overflow' must be false for the timings to count."""
+        return {"overflow": False}
+
+    def record(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """All steps from the start, not timed: pose [T, E, B, 7] and velocity [T, E, B, 6] of the samples, mean contacts."""
+        self.reset()
+        samples, contacts = [self.state()], []
+        for i in range(self.job.steps):
+            self.run(1)
+            contacts.append(self.contacts())
+            if (i + 1) % self.job.every == 0:
+                samples.append(self.state())
+        pose, velocity = (np.stack(arrays) for arrays in zip(*samples, strict=True))
+        return pose, velocity, float(np.mean(contacts))
 
 
-def serve(make: Callable[[Job], Engine], packages: tuple[str, ...]) -> None:
-    """Do the job on stdin with the engine that `make` builds; `packages` are those whose versions are reported."""
+def read(order: dict[str, Any]) -> Job:
+    """The job of an order."""
+    given = order["job"]
+    with np.load(given["state"]) as state:
+        arrays = {name: state[name] for name in (*SHAPES, *BODIES)}
+    arrays |= {name: arrays[name].tolist() for name in ("shape_kind", "shape_body")}
+    return Job(**{key: given[key] for key in ("scene", "dt", "steps", "every", "friction", "restitution", "settings")}, **arrays)
+
+
+def make(order: dict[str, Any], build: Callable[[Job], Engine]) -> tuple[Engine, np.ndarray, dict[str, Any]]:
+    """The engine after its untimed run, the last pose of that, and the reply."""
+    engine = build(read(order))
+    pose, velocity, contacts = engine.record()
+    info = engine.info()
+    engine.settle()
+    np.savez(order["job"]["result"], pose=pose, velocity=velocity, contacts=contacts)
+    return engine, pose[-1], {"info": info}
+
+
+def timed(engine: Engine, last: np.ndarray) -> dict[str, Any]:
+    """One repetition."""
+    engine.reset()
+    begin = time.perf_counter()
+    engine.run(engine.job.steps)
+    seconds = time.perf_counter() - begin
+    return {"seconds": seconds, "same": bool(np.array_equal(engine.state()[0], last, equal_nan=True)), "info": engine.info()}
+
+
+def serve(build: Callable[[Job], Engine], packages: tuple[str, ...]) -> None:
+    """Follow the orders with engines that `build` makes; `packages` are those whose versions are reported."""
     replies = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # engines print, some from C; stdout carries replies only
-    order = json.loads(sys.stdin.readline())
-    with np.load(order["state"]) as state:
-        arrays = {name: state[name] for name in ("half", "mass", "pose", "velocity")}
-    known = ("scene", "envs", "dt", "steps", "friction", "gravity", "settings")
-    engine = make(Job(**{key: order[key] for key in known}, **arrays))
-    result: dict[str, Any] = dict(zip(("recorded_pose", "top", "contacts"), engine.record(), strict=True))
-    engine.reset()
-    result["start_pose"], result["start_velocity"] = engine.state()
-    engine.run()  # warm up
-
-    def wait() -> None:
-        print("ready", file=replies)
-        sys.stdin.readline()
-
-    seconds = []
-    for _ in range(order["repetitions"]):
-        wait()
-        engine.reset()
-        begin = time.perf_counter()
-        engine.run()
-        seconds.append(time.perf_counter() - begin)
-    wait()
-    result["pose"], result["velocity"] = engine.state()
-    np.savez(order["result"], **result)
-    answer = {
-        "seconds": seconds,
-        "median": statistics.median(seconds),
-        "result": order["result"],
-        "versions": {name: version(name) for name in packages},
-        "info": engine.info(),
-    }
-    print(json.dumps(answer), file=replies)
+    print(json.dumps({"versions": {name: version(name) for name in packages}}), file=replies)
+    jobs: dict[Any, tuple[Engine, np.ndarray]] = {}
+    for line in sys.stdin:
+        order, reply = json.loads(line), {}
+        try:
+            if order["do"] == "make":
+                *jobs[order["id"]], reply = make(order, build)
+            elif order["do"] == "run":
+                reply = timed(*jobs[order["id"]])
+            else:
+                del jobs[order["id"]]
+        except Refused as why:
+            reply = {"refused": str(why)}
+        except Exception:
+            reply = {"error": traceback.format_exc()}
+        print(json.dumps(reply), file=replies)

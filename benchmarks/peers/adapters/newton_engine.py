@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the adapters of Newton's solvers share: the model, its collision pipeline, and steps captured in CPU graphs."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any
+
+import newton
+import numpy as np
+import protocol
+import warp as wp
+
+GENEROUS = 16  # contacts for each body in the run that finds how many are needed
+GAP = 0.005  # m, of each shape; two of them are more than what a scene's bodies move in a step, unless they are fast
+LOOK_AHEAD = 1.5  # times the way of the fastest body in a step, where that is more
+
+
+class NewtonEngine(protocol.Engine):
+    """Two states in turn; a graph of one step in either direction. A solver's adapter says how it is made."""
+
+    def __init__(self, job: protocol.Job):
+        wp.set_device("cpu")
+        self.job = job
+        if job.restitution:
+            raise protocol.Refused("restitution is not compared")
+        self.model = self.build()
+        self.control = self.model.control()
+        self.needed = 0
+        self.allocate(job.envs * max(len(job.mass), 1) * GENEROUS)
+
+    @abstractmethod
+    def solver(self) -> newton.solvers.SolverBase:
+        """The solver with the job's settings; self.model and self.pipeline are there."""
+
+    def register(self, builder: newton.ModelBuilder) -> None:
+        """What the solver must tell a builder before bodies are added."""
+
+    def add(self, world: newton.ModelBuilder, **body: Any) -> None:
+        """A free body; one whose solver wants no joints is a link."""
+        world.add_body(**body)
+
+    def build(self) -> newton.Model:
+        """All environments, one world each; colliders of the world belong to every one of them."""
+        job = self.job
+        way = float(np.linalg.norm(job.velocity[..., :3], axis=-1).max(initial=0.0)) * job.dt
+        # Coulomb friction alone: no rolling or torsional friction, which the other engines do not have in these scenes.
+        surface = newton.ModelBuilder.ShapeConfig(
+            density=0.0, mu=job.friction, mu_torsional=0.0, mu_rolling=0.0, gap=max(GAP, LOOK_AHEAD * way)
+        )
+        gravity = tuple(job.gravity.tolist())
+        world = newton.ModelBuilder(gravity=gravity)
+        self.register(world)
+        for pose, mass, inertia in zip(job.pose[0], job.mass.tolist(), job.inertia, strict=True):
+            self.add(world, xform=wp.transform(*pose.tolist()), mass=mass, inertia=wp.mat33(np.diag(inertia)), lock_inertia=True)
+        builder = newton.ModelBuilder(gravity=gravity)
+        self.register(builder)
+        for kind, body, size, pose in zip(job.shape_kind, job.shape_body, job.shape_size.tolist(), job.shape_pose, strict=True):
+            target, place = (builder if body < 0 else world), {"body": body, "xform": wp.transform(*pose.tolist()), "cfg": surface}
+            if kind == "plane":
+                target.add_shape_plane(width=0.0, length=0.0, **place)
+            elif kind == "box":
+                target.add_shape_box(hx=size[0], hy=size[1], hz=size[2], **place)
+            elif kind == "sphere":
+                target.add_shape_sphere(radius=size[0], **place)
+            else:
+                target.add_shape_capsule(radius=size[0], half_height=size[1], **place)
+        builder.replicate(world, job.envs)
+        return builder.finalize(device="cpu")
+
+    def allocate(self, contacts: int) -> None:
+        """A pipeline and a solver with room for this many contacts in all environments together, and graphs of their steps."""
+        self.capacity = contacts
+        self.model.rigid_contact_max = contacts
+        self.pipeline = newton.CollisionPipeline(self.model, rigid_contact_max=contacts, broad_phase="explicit")
+        self.contact_buffer = self.pipeline.contacts()
+        self.engine = self.solver()
+        self.states = (self.model.state(), self.model.state())
+        self.force = wp.array(np.tile(self.job.wrench.astype(np.float32), (self.job.envs, 1)), dtype=wp.spatial_vector, device="cpu")
+        self.reset()
+        self.step(*self.states)  # loads the kernels, which a capture cannot
+        self.reset()
+        self.graphs = []
+        for before, after in (self.states, self.states[::-1]):
+            with wp.ScopedCapture(device="cpu") as capture:
+                self.step(before, after)
+            self.graphs.append(capture.graph)
+        self.reset()
+
+    def step(self, before: newton.State, after: newton.State) -> None:
+        """Collide and step."""
+        if self.job.wrench.any():
+            wp.copy(before.body_f, self.force)
+        self.pipeline.collide(before, self.contact_buffer)
+        self.engine.step(before, after, self.control, self.contact_buffer, self.job.dt)
+
+    def reset(self) -> None:
+        """The first state is the start."""
+        self.steps = 0
+        self.states[0].body_q.assign(self.job.pose.reshape(-1, 7))
+        self.states[0].body_qd.assign(self.job.velocity.reshape(-1, 6))
+
+    def run(self, steps: int) -> None:
+        """The CPU's launches are synchronous."""
+        for _ in range(steps):
+            wp.capture_launch(self.graphs[self.steps % 2])
+            self.steps += 1
+
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Read back."""
+        now = self.states[self.steps % 2]
+        pose, velocity = now.body_q.numpy().astype(float), now.body_qd.numpy().astype(float)
+        return pose.reshape(self.job.pose.shape), velocity.reshape(self.job.velocity.shape)
+
+    def contacts(self) -> float:
+        """Of the pipeline: near ones count, whether they carry or not."""
+        number = int(self.contact_buffer.rigid_contact_count.numpy()[0])
+        self.needed = max(self.needed, number)
+        return number / self.job.envs
+
+    def settle(self) -> None:
+        """Just what was needed at most."""
+        if self.needed > self.capacity:
+            raise RuntimeError(f"{self.capacity} contacts are too few for {self.job.scene}: raise GENEROUS")
+        self.allocate(max(self.needed, 1))
+
+    def info(self) -> dict[str, Any]:
+        """Overflow: seen in the last step; one in an earlier step shows as a motion unlike the recorded one, which had more room."""
+        return {"rigid_contact_max": self.capacity, "overflow": int(self.contact_buffer.rigid_contact_count.numpy()[0]) > self.capacity}
