@@ -180,6 +180,8 @@ def scene(name: str, envs: int | None = None) -> Scene:
     else:
         raise ValueError(f"no scene {name!r}; choose from {', '.join(STEPS)}")
     return boxes(name, half, mass, pose, velocity, friction, steps=STEPS[name])
+
+
 def paper_box(state: str, envs: int) -> tuple[np.ndarray, np.ndarray]:
     """Pose and velocity of the paper's box (Table 1): at rest, sliding as in its example, or dropped tumbling at random."""
     rng = np.random.default_rng(0)

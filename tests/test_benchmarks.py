@@ -4,6 +4,7 @@
 A fake peer stands in for the others, run by this interpreter: nothing here reaches a network.
 """
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -16,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import __main__ as command
 from benchmarks import peers, scenes
+from benchmarks.motion import Motion
 from benchmarks.peers import compare
-from benchmarks.peers.session import PeerError, session
+from benchmarks.peers.session import PeerError, Refused, Task, session
 
 ADAPTERS = Path(peers.__file__).parent / "adapters"
 FAKE = f"""
@@ -25,26 +27,30 @@ import sys
 sys.path.insert(0, {str(ADAPTERS)!r})
 import numpy as np, protocol
 
-class Fake:  # every body glides on with its velocity
+class Fake(protocol.Engine):  # every body glides on with its velocity
     def __init__(self, job):
         self.job, self.runs, self.fault = job, 0, job.settings.get("fault")
         assert self.fault != "raises", "this engine is broken"
+        if self.fault == "refuses":
+            raise protocol.Refused("no such thing")
         print("an engine that prints")
         self.reset()
     def reset(self):
         self.pose = self.job.pose.copy() + (0.1 if self.fault == "start" else 0.0)
-    def run(self):
         self.runs += 1
-        self.pose[..., :3] += self.job.velocity[..., :3] * self.job.dt * self.job.steps
+    def run(self, steps):
+        if self.fault == "dies":
+            sys.exit("no more")
+        for _ in range(steps):
+            self.pose[..., :3] += self.job.velocity[..., :3] * self.job.dt
         if self.fault == "nan":
             self.pose[0, 0, 0] = np.nan
         if self.fault == "drift":
             self.pose[0, 0, 0] += 1e-9 * self.runs
     def state(self):
         return self.pose.copy(), self.job.velocity
-    def record(self):
-        self.run()
-        return self.pose.copy(), self.pose[..., 2], 4.0
+    def contacts(self):
+        return 4.0
     def info(self):
         return {{"overflow": self.fault == "overflow", "runs": self.runs}}
 
@@ -66,7 +72,7 @@ def folder(tmp_path) -> Path:
 
 def fake(folder: Path, **settings) -> peers.Peer:
     """The fake peer with one variant."""
-    return peers.Peer("fake", ("fake==1.0",), {"plain": settings}, folder / "adapter.py")
+    return peers.Peer("fake", "fake", ("fake==1.0",), {"plain": settings}, folder / "adapter.py")
 
 
 def scene(name: str = "slide") -> scenes.Scene:
@@ -74,13 +80,13 @@ def scene(name: str = "slide") -> scenes.Scene:
     return replace(scenes.scene(name, 3), steps=10)
 
 
-def do(folder: Path, repetitions: int = 3, **settings):
-    """A session with the fake peer that did its job."""
-    with session(fake(folder, **settings), "plain", scene(), repetitions, folder) as running:
+def do(folder: Path, repetitions: int = 3, **settings) -> Task:
+    """What the fake peer did with its job."""
+    with session(fake(folder, **settings), folder) as running:
+        task = running.make("plain", scene(), 5)
         for _ in range(repetitions):
-            running.repeat()
-        running.finish()
-    return running
+            task.repeat()
+    return task
 
 
 def test_job_round_trip(folder):
@@ -88,22 +94,41 @@ def test_job_round_trip(folder):
     done = do(folder)
     expected = scene().pose.copy()
     expected[..., 1] += 5.0 * 1e-3 * 10
-    assert len(done.answer["seconds"]) == 3
-    assert done.answer["info"]["runs"] == 5  # recorded, warmed up, timed three times
-    assert set(done.answer["versions"]) == {"numpy"}
-    np.testing.assert_array_equal(done.arrays["start_pose"], scene().pose)
-    np.testing.assert_array_equal(done.arrays["start_velocity"], scene().velocity)
-    np.testing.assert_allclose(done.arrays["pose"], expected, rtol=0, atol=1e-15)
+    assert len(done.seconds) == 3
+    assert done.info["runs"] == 5  # made, recorded, timed three times
+    assert set(done.session.versions) == {"numpy"}
+    assert done.pose.shape == (3, 3, 1, 7)
+    np.testing.assert_array_equal(done.pose[0], scene().pose)
+    np.testing.assert_array_equal(done.velocity[0], scene().velocity)
+    np.testing.assert_allclose(done.pose[1, ..., 1], 0.5 * (scene().pose + expected)[..., 1], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(done.pose[2], expected, rtol=0, atol=1e-15)
     assert compare.problems(scene(), done) == []
 
 
+def test_several_jobs_in_one_process(folder):
+    """They take turns, and one that is dropped is gone."""
+    with session(fake(folder), folder) as running:
+        first, second = running.make("plain", scene()), running.make("plain", scene().copies(2))
+        for task in (first, second, first):
+            task.repeat()
+        assert (len(first.seconds), len(second.seconds)) == (2, 1)
+        assert second.pose.shape[1] == 2
+        first.drop()
+        with pytest.raises(PeerError, match="KeyError"):
+            first.repeat()
+        second.repeat()
+
+
 def test_adapter_alone(folder):
-    """With a job and nothing else on stdin an adapter does all repetitions without waiting."""
+    """Orders on stdin, replies on stdout, the engine's own prints on stderr."""
     scene().save(folder / "state.npz")
-    job = '{"scene": "slide", "envs": 3, "dt": 1e-3, "steps": 10, "friction": 1.0, "gravity": 9.81, "settings": {}, "repetitions": 2, '
-    job += f'"state": "{folder / "state.npz"}", "result": "{folder / "result.npz"}"}}\n'
-    done = subprocess.run([sys.executable, folder / "adapter.py"], input=job, capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[:3] == ["ready"] * 3
+    job = {"scene": "slide", "dt": 1e-3, "steps": 10, "every": 1, "friction": 1.0, "restitution": 0.0, "settings": {}}
+    job |= {"state": str(folder / "state.npz"), "result": str(folder / "result.npz")}
+    orders = [{"do": "make", "id": "a", "job": job}, {"do": "run", "id": "a"}, {"do": "drop", "id": "a"}]
+    text = "".join(json.dumps(order) + "\n" for order in orders)
+    done = subprocess.run([sys.executable, folder / "adapter.py"], input=text, capture_output=True, text=True, check=True)
+    started, made, ran, dropped = [json.loads(line) for line in done.stdout.splitlines()]
+    assert (set(started), set(made), set(ran), dropped) == ({"versions"}, {"info"}, {"seconds", "same", "info"}, {})
     assert "an engine that prints" in done.stderr
     assert (folder / "result.npz").exists()
 
@@ -112,7 +137,7 @@ def test_adapter_alone(folder):
     ("fault", "problem"),
     [
         ("start", "another start pose"),
-        ("nan", "final state not finite"),
+        ("nan", "state not finite"),
         ("drift", "timed and recorded runs differ"),
         ("overflow", "contacts or rows overflowed"),
     ],
@@ -122,16 +147,24 @@ def test_what_does_not_count(folder, fault, problem):
     assert problem in compare.problems(scene(), do(folder, fault=fault))
 
 
-def test_broken_adapter(folder):
-    """What it printed is in the error."""
-    with pytest.raises(PeerError, match="this engine is broken"):
-        do(folder, fault="raises")
+@pytest.mark.parametrize(("fault", "words"), [("raises", "this engine is broken"), ("dies", r"(?s)ended with status 1:.*no more")])
+def test_broken_adapter(folder, fault, words):
+    """What it said is in the error."""
+    with pytest.raises(PeerError, match=words):
+        do(folder, fault=fault)
+
+
+def test_refusal(folder):
+    """Is told from a failure."""
+    with pytest.raises(Refused, match="fake, plain: no such thing"):
+        do(folder, fault="refuses")
 
 
 def test_table(folder):
     """Ours and the peer in turns: both rates, their ratio, the error against a run of ours at a tenth of the step."""
     straight = replace(scene(), velocity=scene().velocity * [1, 1, 1, 0, 0, 0])
-    rows = compare.one(straight, [fake(folder)], 3, folder)
+    with session(fake(folder), folder) as running:
+        rows = compare.one(straight, [running], 3)
     ours, theirs = rows
     assert ours["engine"] == compare.OURS
     assert ours["marked_envs"] == 0
@@ -150,14 +183,15 @@ def test_table(folder):
 def test_remarks():
     """Where the motion is another one the table says so, and says nothing where it is not."""
     start = scene()
-    slid = start.pose + np.array([0, 0.24, 0, 0, 0, 0, 0])
-    ours = compare.Motion(slid, slid[..., 2], 4.0)
-    assert compare.remarks(start, replace(ours, contacts=3.9), ours) == []
-    assert compare.remarks(start, replace(ours, contacts=0.2), ours) == ["touches 5% as often as ours"]
-    half = compare.Motion(start.pose + np.array([0, 0.12, 0, 0, 0, 0, 0]), slid[..., 2], 4.0)
-    assert compare.remarks(start, half, ours) == ["moved 0.120 m, ours 0.240 m"]
-    sunk = compare.Motion(slid - np.array([0, 0, 0.4, 0, 0, 0, 0]), slid[..., 2], 4.0)
-    assert compare.remarks(start, sunk, ours) == ["a box is in the floor"]
+
+    def motion(y: float, z: float = 0.0, contacts: float = 4.0) -> Motion:
+        return Motion.of(start, np.stack([start.pose, start.pose + np.array([0, y, z, 0, 0, 0, 0])]), start.velocity, contacts)
+
+    ours = motion(0.24)
+    assert compare.remarks(start, motion(0.24, contacts=3.9), ours) == []
+    assert compare.remarks(start, motion(0.24, contacts=0.2), ours) == ["touches 5% as often as ours"]
+    assert compare.remarks(start, motion(0.12), ours) == ["moved 0.120 m, ours 0.240 m"]
+    assert compare.remarks(start, motion(0.24, -0.4), ours) == ["a box is in the floor"]
 
 
 def test_overlap_is_measured_not_reported():
@@ -228,11 +262,14 @@ def test_half_an_installation_is_none(folder, monkeypatch):
     monkeypatch.setattr(peers, "subprocess", SimpleNamespace(run=run))
     peer = fake(folder)
     assert peer.installed(folder)
+    peer.install(folder)  # it is there
+    assert calls == []
+    peer = replace(peer, requirements=("fake==2.0",))
     with pytest.raises(subprocess.CalledProcessError):
         peer.install(folder)
     assert calls[0][1:] == ["-m", "venv", str(folder / "fake")]
-    assert calls[1][1:] == ["-m", "pip", "install", "-q", "fake==1.0"]
-    assert not peer.installed(folder)
+    assert calls[1][1:] == ["-m", "pip", "install", "-q", "fake==2.0"]
+    assert not (folder / "fake" / "installed.txt").exists()
 
 
 def test_catalogue():
@@ -260,7 +297,9 @@ def test_real_peer(name):
     peer = peers.PEERS[name]
     if not peer.installed(peers.FOLDER):
         pytest.skip(peers.split([name], peers.FOLDER)[1])
-    for row in compare.one(scene("rest"), [peer], 1, peers.FOLDER)[1:]:
+    with session(peer, peers.FOLDER) as running:
+        rows = compare.one(scene("rest"), [running], 1)
+    for row in rows[1:]:
         assert row["problems"] == []
         assert row["remarks"] == []
         assert row["distance"] < 1e-3

@@ -14,32 +14,22 @@ import statistics
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-import warp_lcp as wl
-
-from .. import scenes
+from .. import motion, scenes
+from ..motion import Motion
 from ..scenes import Scene
 from . import Peer
-from .session import Session, session
+from .session import Session, Task, session
 
 OURS = "warp_lcp, auto float64"
 STILL = ("rest", "stack10")  # scenes that should stay as they start
 FINE_STEP = 1e-4  # s, of the run that 'slide' is compared with
-
-
-@dataclass(frozen=True)
-class Motion:
-    """What an engine did: final pose [E, B, 7], largest height [E, B], mean contacts in an environment and a step."""
-
-    pose: np.ndarray
-    top: np.ndarray
-    contacts: float
 
 
 @contextmanager
@@ -56,32 +46,14 @@ def one_core() -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def record(sim: wl.Simulator, scene: Scene) -> Motion:
-    """Our own motion, step by step and not timed."""
-    sim.reset()
-    top, contacts = np.array(-np.inf), []
-    for _ in range(scene.steps):
-        sim.step()
-        top = np.maximum(top, pose(sim)[..., 2])
-        contacts.append(sim.contacts.count.numpy().mean())
-    return Motion(pose(sim), top, float(np.mean(contacts)))
-
-
-def pose(sim: wl.Simulator) -> np.ndarray:
-    """A copy of [E, B, 7]: a free body's coordinates are its pose."""
-    return np.array(sim.q.numpy()).reshape(sim.num_envs, -1, 7)
-
-
 def reference(scene: Scene) -> np.ndarray | None:
     """The pose that should have come out, [1 or E, B, 7], where there is one: nothing else than chance says where boxes tumble."""
     if scene.name in STILL:
         return scene.pose
     if scene.name != "slide":
         return None
-    one = replace(scene, pose=scene.pose[:1], velocity=scene.velocity[:1])  # its environments are alike
-    fine = one.simulator(dt=FINE_STEP, device="cpu")
-    fine.step(round(scene.steps * scene.dt / FINE_STEP))
-    return pose(fine)
+    one = scene.copies(1)  # its environments are alike
+    return motion.simulate(replace(one, dt=FINE_STEP, steps=round(scene.steps * scene.dt / FINE_STEP)), device="cpu").pose[-1]
 
 
 def penetration(scene: Scene, final: np.ndarray) -> float:
@@ -97,73 +69,69 @@ def penetration(scene: Scene, final: np.ndarray) -> float:
     return max(0.0, -float(np.min(gap, where=np.arange(gap.shape[1]) < count[:, None], initial=0.0)))
 
 
-def errors(scene: Scene, motion: Motion, expected: np.ndarray | None) -> dict[str, float | None]:
+def errors(scene: Scene, moved: Motion, expected: np.ndarray | None) -> dict[str, float | None]:
     """Largest distance [m] and turn [rad] from the expected pose, lift over the start [m] where nothing should rise, overlap [m]."""
     found: dict[str, float | None] = {"distance": None, "angle": None, "lift": None}
     if expected is not None:
-        found["distance"] = float(np.linalg.norm(motion.pose[..., :3] - expected[..., :3], axis=-1).max())
-        cosine = np.abs(np.sum(motion.pose[..., 3:] * expected[..., 3:], axis=-1)) / np.linalg.norm(motion.pose[..., 3:], axis=-1)
+        final = moved.pose[-1]
+        found["distance"] = float(np.linalg.norm(final[..., :3] - expected[..., :3], axis=-1).max())
+        cosine = np.abs(np.sum(final[..., 3:] * expected[..., 3:], axis=-1)) / np.linalg.norm(final[..., 3:], axis=-1)
         found["angle"] = float(2.0 * np.arccos(np.minimum(cosine, 1.0)).max())
-        found["lift"] = max(0.0, float((motion.top - scene.pose[..., 2]).max()))
-    return found | {"penetration": penetration(scene, motion.pose)}
+        found["lift"] = max(0.0, float((moved.pose[..., 2] - scene.pose[..., 2]).max()))
+    return found | {"penetration": penetration(scene, moved.pose[-1])}
 
 
-def problems(scene: Scene, done: Session) -> list[str]:
-    """Why a peer's timings do not count: it did not simulate this scene, or not the same every time."""
-    arrays, found = done.arrays, []
-    for name, ours in (("pose", scene.pose), ("velocity", scene.velocity)):
-        start = arrays[f"start_{name}"]
-        if start.shape != ours.shape or not np.allclose(start, ours, rtol=0.0, atol=1e-5):
+def problems(scene: Scene, done: Task) -> list[str]:
+    """Why a peer's run does not count: it did not simulate this scene, or not the same every time."""
+    found = []
+    for name, start, ours_start in (("pose", done.pose[0], scene.pose), ("velocity", done.velocity[0], scene.velocity)):
+        if start.shape != ours_start.shape or not np.allclose(start, ours_start, rtol=0.0, atol=1e-5):
             found.append(f"another start {name}")
-    if arrays["pose"].shape != scene.pose.shape or not all(np.isfinite(a).all() for a in arrays.values()):
-        found.append("final state not finite")
-    elif not np.array_equal(arrays["pose"], arrays["recorded_pose"]):
+    if not (np.isfinite(done.pose).all() and np.isfinite(done.velocity).all()):
+        found.append("state not finite")
+    elif not done.same:
         found.append("timed and recorded runs differ")
-    if done.answer["info"]["overflow"]:
+    if done.info["overflow"]:
         found.append("contacts or rows overflowed")
     return found
 
 
-def remarks(scene: Scene, motion: Motion, ours: Motion) -> list[str]:
+def remarks(scene: Scene, theirs: Motion, mine: Motion) -> list[str]:
     """How a peer's motion differs from ours so far that its speed is that of another task."""
     found = []
-    if motion.contacts < 0.5 * ours.contacts:
-        found.append(f"touches {motion.contacts / ours.contacts:.0%} as often as ours")
-    moved, expected = (np.linalg.norm((m.pose - scene.pose)[..., :2], axis=-1).mean() for m in (motion, ours))
+    if theirs.contacts < 0.5 * mine.contacts:
+        found.append(f"touches {theirs.contacts / mine.contacts:.0%} as often as ours")
+    moved, expected = (np.linalg.norm((m.pose[-1] - scene.pose)[..., :2], axis=-1).mean() for m in (theirs, mine))
     if scene.name == "slide" and abs(moved / expected - 1.0) > 0.1:
         found.append(f"moved {moved:.3f} m, ours {expected:.3f} m")
-    if motion.pose[..., 2].min() < 0.5 * scene.half.min():
+    if theirs.pose[-1, ..., 2].min() < 0.5 * min(min(shape.size) for shape in scene.shapes if shape.body >= 0):
         found.append("a box is in the floor")
     return found
 
 
-def one(scene: Scene, peers: list[Peer], repetitions: int, folder: Path) -> list[dict[str, Any]]:
+def one(scene: Scene, sessions: list[Session], repetitions: int) -> list[dict[str, Any]]:
     """Ours and every variant of every peer on one scene."""
     sim = scene.simulator(device="cpu")
-    sim.step(2)
+    mine = motion.record(sim, scene)
+    tasks = [each.make(variant, scene) for each in sessions for variant in each.peer.variants]
     seconds: list[float] = []
-    status = np.zeros(scene.envs, dtype=np.int32)
-    with ExitStack() as stack:
-        running = [stack.enter_context(session(peer, variant, scene, repetitions, folder)) for peer in peers for variant in peer.variants]
-        for _ in range(repetitions):
-            sim.reset()
-            begin = time.perf_counter()
-            sim.step(scene.steps)
-            seconds.append(time.perf_counter() - begin)
-            status |= sim.status.numpy()
-            for each in running:
-                each.repeat()
-        for each in running:
-            each.finish()
-        ours, expected = record(sim, scene), reference(scene)
-        rows = [row(scene, OURS, seconds, seconds) | errors(scene, ours, expected)]
-        rows[0] |= {"contacts": ours.contacts, "marked_envs": int(np.count_nonzero(status)), "problems": [], "remarks": []}
-        for each in running:
-            motion = Motion(each.arrays["pose"], each.arrays["top"], float(each.arrays["contacts"]))
-            line = row(scene, each.name, each.answer["seconds"], seconds) | errors(scene, motion, expected)
-            line |= {"contacts": motion.contacts, "problems": problems(scene, each), "remarks": remarks(scene, motion, ours)}
-            line |= {"settings": each.peer.variants[each.variant], "info": each.answer["info"], "versions": each.answer["versions"]}
-            rows.append(line)
+    for _ in range(repetitions):
+        sim.reset()
+        begin = time.perf_counter()
+        sim.step(scene.steps)
+        seconds.append(time.perf_counter() - begin)
+        for task in tasks:
+            task.repeat()
+    expected = reference(scene)
+    rows = [row(scene, OURS, seconds, seconds) | errors(scene, mine, expected)]
+    rows[0] |= {"contacts": mine.contacts, "marked_envs": int(np.count_nonzero(mine.status.any(axis=0))), "problems": [], "remarks": []}
+    for task in tasks:
+        theirs = Motion.of(scene, task.pose, task.velocity, task.contacts)
+        line = row(scene, task.name, task.seconds, seconds) | errors(scene, theirs, expected)
+        line |= {"contacts": task.contacts, "problems": problems(scene, task), "remarks": remarks(scene, theirs, mine)}
+        line |= {"settings": task.session.peer.variants[task.variant], "info": task.info, "versions": task.session.versions}
+        rows.append(line)
+        task.drop()
     return rows
 
 
@@ -187,10 +155,10 @@ def row(scene: Scene, engine: str, seconds: list[float], ours: list[float]) -> d
 
 def measure(peers: list[Peer], quick: bool, folder: Path) -> list[dict[str, Any]]:
     """Every scene with every peer."""
-    with one_core():
-        return [
-            r for name in tqdm(scenes.STEPS, desc="peers", disable=None) for r in one(scenes.scene(name), peers, 5 if quick else 7, folder)
-        ]
+    with one_core(), ExitStack() as stack:
+        sessions = [stack.enter_context(session(peer, folder)) for peer in peers]
+        names = tqdm(scenes.STEPS, desc="peers", disable=None)
+        return [r for name in names for r in one(scenes.scene(name), sessions, 5 if quick else 7)]
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:

@@ -20,7 +20,7 @@ def model(job: Job) -> str:
     if job.restitution:
         raise Refused("MuJoCo has no coefficient of restitution")
     surface = f'condim="3" friction="{job.friction} 0.005 0.0001"' + (f' solref="{s}"' if (s := job.settings.get("solref")) else "")
-    geoms: dict[int, str] = {body: "" for body in range(-1, len(job.mass))}
+    geoms: dict[int, str] = dict.fromkeys(range(-1, len(job.mass)), "")
     for kind, body, size, pose in zip(job.shape_kind, job.shape_body, job.shape_size, job.shape_pose, strict=True):
         extent = {"plane": "0 0 1", "box": numbers(size), "sphere": numbers(size[:1]), "capsule": numbers(size[:2])}[kind]
         place = f'pos="{numbers(pose[:3])}" quat="{numbers(np.roll(pose[3:], 1))}"'

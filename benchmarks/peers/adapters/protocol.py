@@ -90,7 +90,7 @@ class Engine(ABC):
     def contacts(self) -> float:
         """Number of contacts of the last step, mean over the environments. Called after every step of the untimed run."""
 
-    def settle(self) -> None:
+    def settle(self) -> None:  # noqa: B027 (an engine that allocates nothing has nothing to do)
         """After the untimed run: allocate no more than what that one needed."""
 
     def info(self) -> dict[str, Any]:

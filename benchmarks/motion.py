@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an engine, ours or another, made of a scene: samples of poses and velocities, and what follows from them alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import warp_lcp as wl
+
+from .scenes import Scene
+
+
+@dataclass(frozen=True)
+class Motion:
+    """T samples of E environments of B free bodies, the first of them the start.
+
+    Attributes:
+        scene: what was simulated.
+        time: [T] s.
+        pose: [T, E, B, 7], x y z qx qy qz qw. velocity: [T, E, B, 6], linear then angular, world axes.
+        contacts: mean number in an environment and a step.
+        status: [steps, E], of ours alone: Status bits of every step. residual: [steps, E] m/s. iterations: [steps, E].
+    """
+
+    scene: Scene
+    time: np.ndarray
+    pose: np.ndarray
+    velocity: np.ndarray
+    contacts: float
+    status: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int32))
+    residual: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    iterations: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int32))
+
+    @classmethod
+    def of(cls, scene: Scene, pose: np.ndarray, velocity: np.ndarray, contacts: float) -> Motion:
+        """Of samples that lie equally far apart over the scene's steps."""
+        return cls(scene, np.linspace(0.0, scene.steps * scene.dt, len(pose)), pose, velocity, contacts)
+
+    @property
+    def certified(self) -> float:
+        """Share of our env-steps whose answer was certified."""
+        return float(np.mean((self.status & (wl.Status.UNCERTIFIED | wl.Status.NOT_A_NUMBER)) == 0))
+
+    @property
+    def finite(self) -> bool:
+        """Is every number one?"""
+        return bool(np.isfinite(self.pose).all() and np.isfinite(self.velocity).all())
+
+    def energy(self) -> np.ndarray:
+        """[T, E] J: kinetic and of gravity, less the work of the scene's constant forces; friction and impacts may only lower it."""
+        mass, x, v = self.scene.mass, self.pose[..., :3], self.velocity
+        spin = rotate(self.pose[..., 3:] * [-1, -1, -1, 1], v[..., 3:])
+        kinetic = 0.5 * (mass * (v[..., :3] ** 2).sum(axis=-1) + (self.scene.inertia * spin**2).sum(axis=-1))
+        force = mass[:, None] * np.array(self.scene.gravity)
+        if self.scene.wrench is not None:
+            force = force + self.scene.wrench[:, :3]
+        return (kinetic - (force * x).sum(axis=-1)).sum(axis=-1)
+
+
+def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3] turned by unit quaternions [..., 4] (x y z w)."""
+    axis, w = quaternion[..., :3], quaternion[..., 3:]
+    return vector + 2.0 * np.cross(axis, np.cross(axis, vector) + w * vector)
+
+
+def record(sim: wl.Simulator, scene: Scene, every: int = 1) -> Motion:
+    """Our own motion from the scene's start, a sample after every so many steps; the simulator is one of the scene's."""
+    sim.reset()
+    samples, watched, contacts = [(sim.q.numpy().copy(), sim.v.numpy().copy())], [], []
+    for _ in range(scene.steps // every):
+        run = sim.rollout(every, record=("q", "v", "status", "residual", "iterations"))
+        samples.append((run.q.numpy()[-1], run.v.numpy()[-1]))
+        watched.append((run.status.numpy(), run.residual.numpy(), run.iterations.numpy()))
+        contacts.append(sim.contacts.count.numpy().mean())
+    q, v = (np.stack(arrays).astype(float) for arrays in zip(*samples, strict=True))
+    status, residual, iterations = (np.concatenate(arrays) for arrays in zip(*watched, strict=True))
+    shape = (len(q), scene.envs, len(scene.mass))
+    time = sim.dt * every * np.arange(len(q))
+    return Motion(scene, time, q.reshape(*shape, 7), v.reshape(*shape, 6), float(np.mean(contacts)), status, residual, iterations)
+
+
+def simulate(scene: Scene, every: int = 1, material: dict[str, Any] | None = None, **options: Any) -> Motion:
+    """Our own motion, with a Simulator of these options."""
+    return record(scene.simulator(material=material, **options), scene, every)
