@@ -68,7 +68,7 @@ def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 def record(sim: wl.Simulator, scene: Scene, every: int = 1) -> Motion:
     """Our own motion from the scene's start, a sample after every so many steps; the simulator is one of the scene's."""
-    sim.reset()
+    scene.restart(sim)
     samples, watched, contacts = [(sim.q.numpy().copy(), sim.v.numpy().copy())], [], []
     for _ in range(scene.steps // every):
         run = sim.rollout(every, record=("q", "v", "status", "residual", "iterations"))
@@ -85,3 +85,16 @@ def record(sim: wl.Simulator, scene: Scene, every: int = 1) -> Motion:
 def simulate(scene: Scene, every: int = 1, material: dict[str, Any] | None = None, **options: Any) -> Motion:
     """Our own motion, with a Simulator of these options."""
     return record(scene.simulator(material=material, **options), scene, every)
+
+
+def penetration(scene: Scene, final: np.ndarray) -> float:
+    """Deepest overlap [m] of anybody's final poses, measured by our collision detection; NaN for poses that are not finite."""
+    if not np.isfinite(final).all():
+        return float("nan")
+    sim = scene.simulator(device="cpu")
+    sim.q0.assign(final.reshape(scene.envs, -1))
+    sim.v0.zero_()
+    sim.reset()
+    sim.step()
+    gap, count = sim.contacts.gap.numpy(), sim.contacts.count.numpy()
+    return max(0.0, -float(np.min(gap, where=np.arange(gap.shape[1]) < count[:, None], initial=0.0)))

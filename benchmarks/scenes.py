@@ -106,10 +106,14 @@ class Scene:
         sim = wl.Simulator(self.model(**material or {}), self.envs, self.dt if dt is None else dt, **options)
         sim.q0.assign(self.pose.reshape(self.envs, -1))
         sim.v0.assign(self.velocity.reshape(self.envs, -1))
+        self.restart(sim)
+        return sim
+
+    def restart(self, sim: wl.Simulator) -> None:
+        """Put a simulator of the scene back to the start, constant forces applied: a reset clears them."""
+        sim.reset()
         if self.wrench is not None:
             sim.wrench.assign(np.tile(self.wrench, (self.envs, 1, 1)))
-        sim.reset()
-        return sim
 
     def save(self, path: Path) -> None:
         """What an adapter reads: the arrays of this class, and the colliders as shape_kind, shape_body, shape_size, shape_pose."""

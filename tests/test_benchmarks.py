@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks import __main__ as command
-from benchmarks import peers, scenes
+from benchmarks import motion, peers, scenes
 from benchmarks.motion import Motion
 from benchmarks.peers import compare
 from benchmarks.peers.session import PeerError, Refused, Task, session
@@ -184,14 +184,14 @@ def test_remarks():
     """Where the motion is another one the table says so, and says nothing where it is not."""
     start = scene()
 
-    def motion(y: float, z: float = 0.0, contacts: float = 4.0) -> Motion:
+    def moved(y: float, z: float = 0.0, contacts: float = 4.0) -> Motion:
         return Motion.of(start, np.stack([start.pose, start.pose + np.array([0, y, z, 0, 0, 0, 0])]), start.velocity, contacts)
 
-    ours = motion(0.24)
-    assert compare.remarks(start, motion(0.24, contacts=3.9), ours) == []
-    assert compare.remarks(start, motion(0.24, contacts=0.2), ours) == ["touches 5% as often as ours"]
-    assert compare.remarks(start, motion(0.12), ours) == ["moved 0.120 m, ours 0.240 m"]
-    assert compare.remarks(start, motion(0.24, -0.4), ours) == ["a box is in the floor"]
+    ours = moved(0.24)
+    assert compare.remarks(start, moved(0.24, contacts=3.9), ours) == []
+    assert compare.remarks(start, moved(0.24, contacts=0.2), ours) == ["touches 5% as often as ours"]
+    assert compare.remarks(start, moved(0.12), ours) == ["moved 0.120 m, ours 0.240 m"]
+    assert compare.remarks(start, moved(0.24, -0.4), ours) == ["a box is in the floor"]
 
 
 def test_overlap_is_measured_not_reported():
@@ -199,10 +199,10 @@ def test_overlap_is_measured_not_reported():
     start = scenes.scene("stack10", 2)
     moved = start.pose.copy()
     moved[1, 3:, 2] -= 0.002
-    assert compare.penetration(start, start.pose) < 1e-12
-    assert compare.penetration(start, moved) == pytest.approx(0.002, abs=1e-9)
+    assert motion.penetration(start, start.pose) < 1e-12
+    assert motion.penetration(start, moved) == pytest.approx(0.002, abs=1e-9)
     moved[0, 0, 0] = np.nan
-    assert np.isnan(compare.penetration(start, moved))
+    assert np.isnan(motion.penetration(start, moved))
 
 
 def test_states_of_mujoco(monkeypatch):
@@ -226,7 +226,7 @@ def test_scenes_start_without_overlap():
         start = scenes.scene(name, 8)
         assert start.steps % 2 == 0
         if name != "tumble":  # some of its boxes start a little inside the plane, as they always have
-            assert compare.penetration(start, start.pose) < 1e-12
+            assert motion.penetration(start, start.pose) < 1e-12
     heap = scenes.scene("pile5", 8)
     assert len(np.unique(heap.pose[:, 0], axis=0)) == 8
 

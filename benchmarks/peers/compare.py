@@ -56,19 +56,6 @@ def reference(scene: Scene) -> np.ndarray | None:
     return motion.simulate(replace(one, dt=FINE_STEP, steps=round(scene.steps * scene.dt / FINE_STEP)), device="cpu").pose[-1]
 
 
-def penetration(scene: Scene, final: np.ndarray) -> float:
-    """Deepest overlap [m] of anybody's final poses, measured by our collision detection; NaN for poses that are not finite."""
-    if not np.isfinite(final).all():
-        return float("nan")
-    sim = scene.simulator(device="cpu")
-    sim.q0.assign(final.reshape(scene.envs, -1))
-    sim.v0.zero_()
-    sim.reset()
-    sim.step()
-    gap, count = sim.contacts.gap.numpy(), sim.contacts.count.numpy()
-    return max(0.0, -float(np.min(gap, where=np.arange(gap.shape[1]) < count[:, None], initial=0.0)))
-
-
 def errors(scene: Scene, moved: Motion, expected: np.ndarray | None) -> dict[str, float | None]:
     """Largest distance [m] and turn [rad] from the expected pose, lift over the start [m] where nothing should rise, overlap [m]."""
     found: dict[str, float | None] = {"distance": None, "angle": None, "lift": None}
@@ -78,7 +65,7 @@ def errors(scene: Scene, moved: Motion, expected: np.ndarray | None) -> dict[str
         cosine = np.abs(np.sum(final[..., 3:] * expected[..., 3:], axis=-1)) / np.linalg.norm(final[..., 3:], axis=-1)
         found["angle"] = float(2.0 * np.arccos(np.minimum(cosine, 1.0)).max())
         found["lift"] = max(0.0, float((moved.pose[..., 2] - scene.pose[..., 2]).max()))
-    return found | {"penetration": penetration(scene, moved.pose[-1])}
+    return found | {"penetration": motion.penetration(scene, moved.pose[-1])}
 
 
 def problems(scene: Scene, done: Task) -> list[str]:
@@ -116,7 +103,7 @@ def one(scene: Scene, sessions: list[Session], repetitions: int) -> list[dict[st
     tasks = [each.make(variant, scene) for each in sessions for variant in each.peer.variants]
     seconds: list[float] = []
     for _ in range(repetitions):
-        sim.reset()
+        scene.restart(sim)
         begin = time.perf_counter()
         sim.step(scene.steps)
         seconds.append(time.perf_counter() - begin)

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far every case is from what is known of it, over step sizes; errors of the law and of the step told apart.
+
+The *model* error is against the exact cone (`coulomb`, certified) at the same step; the *discretisation* error is that of
+the exact cone against the reference; the *total* is what a user gets. No error here is against a run of the same method.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from .cases import CASES, Case
+
+STEPS = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4)
+QUICK_STEPS = (1e-2, 1e-3)
+LAWS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "coulomb": {"formulation": "coulomb"},
+    "midpoint": {"integrator": "midpoint"},
+}
+#: Errors under this share of the largest one, or under this size, are round-off or compliance and have no order.
+FLOOR, LEAST = 1e-6, 1e-7
+
+
+def order(steps: list[float], errors: list[float]) -> float | None:
+    """Slope of log error over log step, by least squares; None where the error does not come from the step."""
+    e = np.array(errors)
+    if not np.isfinite(e).all() or e.max() < LEAST or len(e) < 2 or e[np.argmin(steps)] > 0.5 * e[np.argmax(steps)]:
+        return None
+    kept = e > max(FLOOR * e.max(), 1e-3 * LEAST)
+    return float(np.polyfit(np.log(np.array(steps)[kept]), np.log(e[kept]), 1)[0]) if kept.sum() > 1 else None
+
+
+def one(case: Case, steps: tuple[float, ...], device: Any) -> list[dict[str, Any]]:
+    """Every metric of a case under every law."""
+    found: dict[str, list[dict[str, Any]]] = {law: [] for law in LAWS}
+    for h in steps:
+        seen, runs = {}, {}
+        for law, options in LAWS.items():
+            moved = case.simulate(h, device=device, **options)
+            runs[law] = moved
+            seen[law] = [metric.seen(moved) for metric in case.metrics]
+        for law, moved in runs.items():
+            for i, metric in enumerate(case.metrics):
+                expected = metric.expected(moved.scene.envs)
+                found[law].append(
+                    {
+                        "metric": metric.name,
+                        "unit": metric.unit,
+                        "h": h,
+                        "total": metric.distance(seen[law][i], expected),
+                        "model": metric.distance(seen[law][i], seen["coulomb"][i]),
+                        "discretisation": metric.distance(seen["coulomb"][i], expected),
+                        "bar": metric.bar(h),
+                        "certified": moved.certified,
+                        "energy_rise": case.energy_rise(moved),
+                    }
+                )
+    rows = []
+    for law, lines in found.items():
+        for metric in case.metrics:
+            mine = [line for line in lines if line["metric"] == metric.name]
+            row = {"case": case.name, "law": law, "metric": metric.name, "unit": metric.unit, "bar_is_for": "model" if metric.model else "total"}
+            for key in ("h", "total", "model", "discretisation", "bar", "certified", "energy_rise"):
+                row[key] = [line[key] for line in mine]
+            row["order"] = order(row["h"], row["total"])
+            error = row["model"] if metric.model else row["total"]
+            row["within"] = [e <= bar for e, bar in zip(error, row["bar"], strict=True)]
+            rows.append(row)
+    return rows
+
+
+def measure(device: Any, names: list[str], quick: bool) -> list[dict[str, Any]]:
+    """Every case."""
+    steps = QUICK_STEPS if quick else STEPS
+    bar = tqdm(names, desc="accuracy", disable=None)
+    return [row for name in bar for row in one(CASES[name], steps, device)]
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """A line for each case, metric and law: errors at every step, their order, and the two parts at the largest and the smallest step."""
+    steps = rows[0]["h"]
+    heads = ["case", "metric", "law", *(f"{1e3 * h:g} ms" for h in steps), "order", "of the law", "of the step"]
+    lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
+    for row in rows:
+        cells = [f"{e:.1e}" if ok else f"**{e:.1e}**" for e, ok in zip(row["total"], row["within"], strict=True)]
+        size = "-" if row["order"] is None else f"{row['order']:.2f}"
+        parts = (f"{row[part][0]:.0e} … {row[part][-1]:.0e}" for part in ("model", "discretisation"))
+        lines.append("| " + " | ".join([row["case"], f"{row['metric']} [{row['unit']}]", row["law"], *cells, size, *parts]) + " |")
+    low = min(min(row["certified"]) for row in rows)
+    rise = max(max(row["energy_rise"]) for row in rows)
+    outside = sum(not ok for row in rows for ok in row["within"])
+    total = sum(len(row["within"]) for row in rows)
+    lines.append(
+        f"\nBold: over the bar ({outside} of {total}). Certified: at least {100 * low:.2f} % of the env-steps of every run. "
+        f"Energy: never above its start by more than {rise:.0e} of it."
+    )
+    return "\n".join(lines)
