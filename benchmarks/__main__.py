@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks speed|robust|resources|lcp|friction|paper|peers [--help]"""
+"""python -m benchmarks accuracy|stability|speed|robust|resources|lcp|friction|paper|peers [--help]"""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from . import friction, goals, lcp, paper, paper_picture, peers, report, resources, robust, speed, step_floor
+from . import accuracy, friction, goals, lcp, paper, paper_picture, peers, report, resources, robust, speed, stability, step_floor
+from .cases import case_names
 from .peers import compare
 
 
@@ -33,6 +34,17 @@ def arguments() -> argparse.Namespace:
     place.add_argument("--dir", type=Path, default=peers.FOLDER, help="folder of the peers' interpreters")
     commands = parser.add_subparsers(dest="what", required=True)
 
+    which = argparse.ArgumentParser(add_help=False)
+    which.add_argument("--cases", type=case_names, default="all", metavar="all|NAME,...", help="scenes with known outcome (default: all)")
+    which.add_argument("--device", default=None, help="Warp device (default: Warp's)")
+    commands.add_parser("accuracy", parents=[out, quick, which], help="errors of every case against what is known of it, over step sizes")
+    breaking = commands.add_parser(
+        "stability", parents=[out, quick, which], help="which cases break which law, method and precision, and why"
+    )
+    breaking.add_argument(
+        "--variants", type=stability.chosen, default="all", metavar="all|NAME;...", help="laws and methods (default: all)"
+    )
+    breaking.add_argument("--envs", type=int, default=None, help="randomised copies of each case (default 4096; with --quick 64)")
     timing = commands.add_parser(
         "speed", parents=[out, quick, place], help="env-steps/s of the paper's box, start-up, mass ratios, fallback, floors, peers"
     )
@@ -106,6 +118,15 @@ def main() -> None:
         data = compared(asked.names, asked.quick, asked.dir)
         if not data:
             return
+    elif asked.what == "accuracy":
+        rows = accuracy.measure(device, asked.cases, asked.quick)
+        print(accuracy.markdown(rows))
+        data = {"rows": rows}
+    elif asked.what == "stability":
+        rows = stability.measure(device, asked.cases, asked.variants, asked.quick)
+        crowds = stability.crowd(device, asked.cases, asked.envs or (64 if asked.quick else 4096))
+        print(stability.markdown(rows, crowds))
+        data = {"rows": rows, "crowds": crowds}
     elif asked.what == "paper":
         data = paper.measure(device, asked.quick)
         print(paper.markdown(data))

@@ -63,7 +63,13 @@ def one(case: Case, steps: tuple[float, ...], device: Any) -> list[dict[str, Any
     for law, lines in found.items():
         for metric in case.metrics:
             mine = [line for line in lines if line["metric"] == metric.name]
-            row = {"case": case.name, "law": law, "metric": metric.name, "unit": metric.unit, "bar_is_for": "model" if metric.model else "total"}
+            row = {
+                "case": case.name,
+                "law": law,
+                "metric": metric.name,
+                "unit": metric.unit,
+                "bar_is_for": "model" if metric.model else "total",
+            }
             for key in ("h", "total", "model", "discretisation", "bar", "certified", "energy_rise"):
                 row[key] = [line[key] for line in mine]
             row["order"] = order(row["h"], row["total"])

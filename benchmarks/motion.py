@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,11 +68,22 @@ def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
     return vector + 2.0 * np.cross(axis, np.cross(axis, vector) + w * vector)
 
 
-def record(sim: wl.Simulator, scene: Scene, every: int = 1) -> Motion:
-    """Our own motion from the scene's start, a sample after every so many steps; the simulator is one of the scene's."""
+class TooSlow(RuntimeError):
+    """A run that was given up; the message says how far it came."""
+
+
+def record(sim: wl.Simulator, scene: Scene, every: int = 1, limit: float = math.inf) -> Motion:
+    """Our own motion from the scene's start, a sample after every so many steps; the simulator is one of the scene's.
+
+    Raises:
+        TooSlow: when it has not come to its end after `limit` seconds.
+    """
     scene.restart(sim)
+    begin = time.perf_counter()
     samples, watched, contacts = [(sim.q.numpy().copy(), sim.v.numpy().copy())], [], []
-    for _ in range(scene.steps // every):
+    for i in range(scene.steps // every):
+        if (elapsed := time.perf_counter() - begin) > limit:
+            raise TooSlow(f"{i * every} of {scene.steps} steps after {elapsed:.0f} s, {1e3 * elapsed / (i * every):.2g} ms each")
         run = sim.rollout(every, record=("q", "v", "status", "residual", "iterations"))
         samples.append((run.q.numpy()[-1], run.v.numpy()[-1]))
         watched.append((run.status.numpy(), run.residual.numpy(), run.iterations.numpy()))
@@ -78,13 +91,13 @@ def record(sim: wl.Simulator, scene: Scene, every: int = 1) -> Motion:
     q, v = (np.stack(arrays).astype(float) for arrays in zip(*samples, strict=True))
     status, residual, iterations = (np.concatenate(arrays) for arrays in zip(*watched, strict=True))
     shape = (len(q), scene.envs, len(scene.mass))
-    time = sim.dt * every * np.arange(len(q))
-    return Motion(scene, time, q.reshape(*shape, 7), v.reshape(*shape, 6), float(np.mean(contacts)), status, residual, iterations)
+    times = sim.dt * every * np.arange(len(q))
+    return Motion(scene, times, q.reshape(*shape, 7), v.reshape(*shape, 6), float(np.mean(contacts)), status, residual, iterations)
 
 
-def simulate(scene: Scene, every: int = 1, material: dict[str, Any] | None = None, **options: Any) -> Motion:
+def simulate(scene: Scene, every: int = 1, material: dict[str, Any] | None = None, limit: float = math.inf, **options: Any) -> Motion:
     """Our own motion, with a Simulator of these options."""
-    return record(scene.simulator(material=material, **options), scene, every)
+    return record(scene.simulator(material=material, **options), scene, every, limit)
 
 
 def penetration(scene: Scene, final: np.ndarray) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What hits, flies or jams: bouncing balls, Newton's cradle, a free body that flips, a rocking block, thin plates, a Painleve rod, a heap."""
+"""What hits, flies or jams: a bouncing ball, Newton's cradle, a flipping body, a rocking block, thin plates, a Painleve rod, a heap."""
 
 from __future__ import annotations
 
