@@ -113,9 +113,10 @@ class Drake(protocol.Engine):
         if job.restitution:
             raise protocol.Refused("contacts of Drake have dissipation, not Newton's restitution")
         self.job = job
-        # SAP's own tolerances and its regularisation of friction are out of Python's reach; this threshold is not. It softens
-        # contacts by masses as if each were alone: SAP lets 1000 times its mass sink through a box unless it is 0.
-        stiff = {"sap_near_rigid_threshold": 0.0} if "sag" in job.settings else {}
+        # The solver's tolerances and SAP's regularisation of friction are out of Python's reach. SAP softens contacts by the bodies'
+        # masses (a box sinks through another of 1/1000 of its mass) unless the threshold is 0; the others slip at up to the stiction
+        # tolerance where they should stick, 1e-4 m/s by default, and below 1e-6 m/s nothing gets better.
+        stiff = {"sap_near_rigid_threshold": 0.0, "stiction_tolerance": 1e-6} if "sag" in job.settings else {}
         config = MultibodyPlantConfig(time_step=job.dt, discrete_contact_approximation=job.settings["approximation"], **stiff)
         builder = DiagramBuilder()
         self.plant, scene = AddMultibodyPlant(config, builder)
