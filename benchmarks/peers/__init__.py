@@ -71,7 +71,8 @@ class Peer:
 
 # MuJoCo's default contact is a spring with a time constant of 20 ms; the stiffest that it allows has two steps.
 STIFF = "0.002 1"
-# Drake's contacts are springs of 1e6 N/m, or 1e7 Pa where boxes meet; stiffer than this, "lagged" throws the paper's box up.
+# Drake's contacts are springs of 1e6 N/m, or 1e7 Pa where boxes meet. This is how far [m] a box may sink under the weight of all;
+# a fifth of it, and "lagged" throws the paper's box up.
 SAG = 5e-6
 NEWTON = ("newton==1.8.0", "warp-lang==1.19.0")
 PEERS = {
@@ -98,7 +99,7 @@ PEERS = {
             "drake",
             ("drake==1.51.1",),
             {
-                # Drake's default, and the model of its papers; its third, "similar", does as "sap", and fails where that is stiff.
+                # Drake's default, and the one named after its solver; its third, "similar", moves as "sap" does, and stiffer it fails.
                 "lagged": {"approximation": "lagged"},
                 "lagged, stiff": {"approximation": "lagged", "sag": SAG},
                 "sap": {"approximation": "sap"},
