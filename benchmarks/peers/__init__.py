@@ -71,6 +71,9 @@ class Peer:
 
 # MuJoCo's default contact is a spring with a time constant of 20 ms; the stiffest that it allows has two steps.
 STIFF = "0.002 1"
+# Drake's contacts are springs of 1e6 N/m, or 1e7 Pa where boxes meet. This is how far [m] a box may sink under the weight of all;
+# a fifth of it, and "lagged" throws the paper's box up.
+SAG = 5e-6
 NEWTON = ("newton==1.8.0", "warp-lang==1.19.0")
 PEERS = {
     peer.name: peer
@@ -90,6 +93,18 @@ PEERS = {
             "mujoco_warp",
             ("mujoco-warp==4.0.0", "mujoco==4.0.0", "warp-lang==1.19.0"),
             {"pyramidal": {"cone": "pyramidal"}, "elliptic": {"cone": "elliptic"}},
+        ),
+        Peer(
+            "drake",
+            "drake",
+            ("drake==1.51.1",),
+            {
+                # Drake's default, and the one named after its solver; its third, "similar", moves as "sap" does, and stiffer it fails.
+                "lagged": {"approximation": "lagged"},
+                "lagged, stiff": {"approximation": "lagged", "sag": SAG},
+                "sap": {"approximation": "sap"},
+                "sap, stiff": {"approximation": "sap", "sag": SAG},
+            },
         ),
         Peer("newton_xpbd", "newton", NEWTON, {f"{n} iterations": {"iterations": n} for n in (2, 10, 20)}),
     )
