@@ -24,6 +24,7 @@ class Motion:
         time: [T] s.
         pose: [T, E, B, 7], x y z qx qy qz qw. velocity: [T, E, B, 6], linear then angular, world axes.
         contacts: mean number in an environment and a step.
+        before: pose and velocity one step before each sample but the first.
         status: [steps, E], of ours alone: Status bits of every step. residual: [steps, E] m/s. iterations: [steps, E].
     """
 
@@ -32,14 +33,15 @@ class Motion:
     pose: np.ndarray
     velocity: np.ndarray
     contacts: float
+    before: tuple[np.ndarray, np.ndarray] | None = None
     status: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int32))
     residual: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     iterations: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int32))
 
     @classmethod
-    def of(cls, scene: Scene, pose: np.ndarray, velocity: np.ndarray, contacts: float) -> Motion:
+    def of(cls, scene: Scene, pose: np.ndarray, velocity: np.ndarray, contacts: float, **more: Any) -> Motion:
         """Of samples that lie equally far apart over the scene's steps."""
-        return cls(scene, np.linspace(0.0, scene.steps * scene.dt, len(pose)), pose, velocity, contacts)
+        return cls(scene, np.linspace(0.0, scene.steps * scene.dt, len(pose)), pose, velocity, contacts, **more)
 
     @property
     def certified(self) -> float:
@@ -80,19 +82,26 @@ def record(sim: wl.Simulator, scene: Scene, every: int = 1, limit: float = math.
     """
     scene.restart(sim)
     begin = time.perf_counter()
-    samples, watched, contacts = [(sim.q.numpy().copy(), sim.v.numpy().copy())], [], []
+    samples, before, watched, contacts = [(sim.q.numpy().copy(), sim.v.numpy().copy())], [], [], []
     for i in range(scene.steps // every):
         if (elapsed := time.perf_counter() - begin) > limit:
             raise TooSlow(f"{i * every} of {scene.steps} steps after {elapsed:.0f} s, {1e3 * elapsed / (i * every):.2g} ms each")
         run = sim.rollout(every, record=("q", "v", "status", "residual", "iterations"))
-        samples.append((run.q.numpy()[-1], run.v.numpy()[-1]))
+        q, v = run.q.numpy(), run.v.numpy()
+        before.append((q[-2], v[-2]) if every > 1 else samples[-1])
+        samples.append((q[-1], v[-1]))
         watched.append((run.status.numpy(), run.residual.numpy(), run.iterations.numpy()))
         contacts.append(sim.contacts.count.numpy().mean())
-    q, v = (np.stack(arrays).astype(float) for arrays in zip(*samples, strict=True))
+    shape = (-1, scene.envs, len(scene.mass))
+
+    def stacked(states: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+        q, v = (np.stack(arrays).astype(float) for arrays in zip(*states, strict=True))
+        return q.reshape(*shape, 7), v.reshape(*shape, 6)
+
     status, residual, iterations = (np.concatenate(arrays) for arrays in zip(*watched, strict=True))
-    shape = (len(q), scene.envs, len(scene.mass))
-    times = sim.dt * every * np.arange(len(q))
-    return Motion(scene, times, q.reshape(*shape, 7), v.reshape(*shape, 6), float(np.mean(contacts)), status, residual, iterations)
+    pose, velocity = stacked(samples)
+    times = sim.dt * every * np.arange(len(pose))
+    return Motion(scene, times, pose, velocity, float(np.mean(contacts)), stacked(before), status, residual, iterations)
 
 
 def simulate(scene: Scene, every: int = 1, material: dict[str, Any] | None = None, limit: float = math.inf, **options: Any) -> Motion:

@@ -33,6 +33,7 @@ class Task:
 
     Attributes:
         pose, velocity: [T, E, B, 7], [T, E, B, 6] at the start and after every `every` steps.
+        before_pose, before_velocity: [T - 1, E, B, ..] one step before each of the later samples.
         contacts: mean number in an environment and a step.
         info: of the last run: what the engine allocated, and whether that was enough ('overflow').
         same: whether all timed runs ended where the first one did.
@@ -43,6 +44,8 @@ class Task:
     id: int
     pose: np.ndarray
     velocity: np.ndarray
+    before_pose: np.ndarray
+    before_velocity: np.ndarray
     contacts: float
     info: dict[str, Any]
     same: bool = True
@@ -113,7 +116,8 @@ class Session:
         job |= {"scene": scene.name, "every": every, "settings": self.peer.variants[variant], "state": str(state), "result": str(result)}
         reply = self.order({"do": "make", "id": index, "job": job}, variant)
         with np.load(result) as arrays:
-            task = Task(self, variant, index, arrays["pose"], arrays["velocity"], float(arrays["contacts"]), reply["info"])
+            states = {name: arrays[name] for name in ("pose", "velocity", "before_pose", "before_velocity")}
+            task = Task(self, variant, index, **states, contacts=float(arrays["contacts"]), info=reply["info"])
         result.unlink()
         state.unlink()
         return task

@@ -182,23 +182,29 @@ class Drake(protocol.Engine):
         surfaces = (found.hydroelastic_contact_info(i).contact_surface() for i in range(found.num_hydroelastic_contacts()))
         return found.num_point_pair_contacts() + sum(surface.num_faces() for surface in surfaces)
 
-    def record(self) -> tuple[np.ndarray, np.ndarray, float]:
+    def record(self) -> dict[str, Any]:
         """One environment after another, as in run(), but a step at a time."""
         self.reset()
-        samples, contacts = np.empty((self.job.steps // self.job.every + 1, *self.last.shape)), 0.0
-        samples[0] = self.start
+        path, contacts = np.empty((self.job.steps + 1, *self.last.shape)), 0.0
+        path[0] = self.start
         for env in range(self.job.envs):
             self.enter(env)
             for i in range(1, self.job.steps + 1):
                 self.advance(i)
                 contacts += self.contacts()
-                if i % self.job.every == 0:
-                    samples[i // self.job.every, env] = self.plant.GetPositionsAndVelocities(self.context)
-        states = []
-        for self.last in samples:
-            states.append(self.state())
-        pose, velocity = (np.stack(arrays) for arrays in zip(*states, strict=True))
-        return pose, velocity, contacts / (self.job.envs * self.job.steps)
+                path[i, env] = self.plant.GetPositionsAndVelocities(self.context)
+
+        def states(indices: range) -> list[protocol.State]:
+            found = []
+            for i in indices:
+                self.last = path[i]
+                found.append(self.state())
+            return found
+
+        every, end = self.job.every, self.job.steps + 1
+        samples, before = states(range(0, end, every)), states(range(every - 1, end - 1, every))
+        self.last = path[-1]
+        return self.result(samples, before, contacts / (self.job.envs * self.job.steps))
 
 
 if __name__ == "__main__":

@@ -59,12 +59,13 @@ class MuJoCo(protocol.Engine):
             found.append(self.data.ncon)
         return float(np.mean(found))
 
-    def record(self) -> tuple[np.ndarray, np.ndarray, float]:
+    def record(self) -> dict[str, Any]:
         """The trajectories hold every step."""
         self.run(self.job.steps)
-        samples = np.concatenate([self.start[:, None], self.states[:, self.job.every - 1 :: self.job.every]], axis=1)
-        pose, velocity = self.unpacked(samples.swapaxes(0, 1))
-        return pose, velocity, self.contacts()
+        every, path = self.job.every, np.concatenate([self.start[:, None], self.states], axis=1)
+        samples = [self.unpacked(path[:, i]) for i in range(0, self.job.steps + 1, every)]
+        before = [self.unpacked(path[:, i - 1]) for i in range(every, self.job.steps + 1, every)]
+        return self.result(samples, before, self.contacts())
 
     def info(self) -> dict[str, Any]:
         """Overflow: a rollout stops an environment's clock at any of MuJoCo's warnings (memory full, bad numbers)."""

@@ -6,8 +6,9 @@ Orders, each with the "id" of a job that the caller chooses:
     {"do": "make", "id", "job": {scene, dt, steps, every, friction, restitution, settings, state, result}}
         Build the engine and run the job once, not timed. `state` is the .npz that benchmarks.scenes.Scene.save writes. The
         reply is {info}; the .npz `result` holds pose [T, E, B, 7] (x y z qx qy qz qw) and velocity [T, E, B, 6] (linear of the
-        centre of mass, then angular; world axes) at the start and after every `every` steps, as the engine gives them back, and
-        contacts, their mean number in an environment and a step.
+        centre of mass, then angular; world axes) at the start and after every `every` steps, as the engine gives them back,
+        before_pose and before_velocity [T - 1, E, B, ..], one step before each of the later samples, and contacts, their mean
+        number in an environment and a step.
     {"do": "run", "id"}
         All steps from the start, timed. The reply is {seconds, same, info}: same says whether it ended where the first run did.
     {"do": "drop", "id"}
@@ -33,6 +34,7 @@ from typing import Any
 
 import numpy as np
 
+State = tuple[np.ndarray, np.ndarray]
 SHAPES = ("shape_kind", "shape_body", "shape_size", "shape_pose")
 BODIES = ("mass", "inertia", "pose", "velocity", "gravity", "wrench")
 
@@ -83,7 +85,7 @@ class Engine(ABC):
         """Advance by so many steps: what is timed."""
 
     @abstractmethod
-    def state(self) -> tuple[np.ndarray, np.ndarray]:
+    def state(self) -> State:
         """The present state, in float64."""
 
     @abstractmethod
@@ -97,17 +99,32 @@ class Engine(ABC):
         """What was allocated and what went wrong since the reset; key 'overflow' must be false for the timings to count."""
         return {"overflow": False}
 
-    def record(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """All steps from the start, not timed: pose [T, E, B, 7] and velocity [T, E, B, 6] of the samples, mean contacts."""
+    def record(self) -> dict[str, Any]:
+        """All steps from the start, not timed: what `result` holds."""
         self.reset()
-        samples, contacts = [self.state()], []
+        samples, before, contacts = [self.state()], [], []
         for i in range(self.job.steps):
+            last = (i + 1) % self.job.every == 0
+            if last:
+                before.append(self.state())
             self.run(1)
             contacts.append(self.contacts())
-            if (i + 1) % self.job.every == 0:
+            if last:
                 samples.append(self.state())
+        return self.result(samples, before, float(np.mean(contacts)))
+
+    @staticmethod
+    def result(samples: list[State], before: list[State], contacts: float) -> dict[str, Any]:
+        """As `result` holds it."""
         pose, velocity = (np.stack(arrays) for arrays in zip(*samples, strict=True))
-        return pose, velocity, float(np.mean(contacts))
+        before_pose, before_velocity = (np.stack(arrays) for arrays in zip(*before, strict=True))
+        return {
+            "pose": pose,
+            "velocity": velocity,
+            "before_pose": before_pose,
+            "before_velocity": before_velocity,
+            "contacts": contacts,
+        }
 
 
 def read(order: dict[str, Any]) -> Job:
@@ -122,11 +139,11 @@ def read(order: dict[str, Any]) -> Job:
 def make(order: dict[str, Any], build: Callable[[Job], Engine]) -> tuple[Engine, np.ndarray, dict[str, Any]]:
     """The engine after its untimed run, the last pose of that, and the reply."""
     engine = build(read(order))
-    pose, velocity, contacts = engine.record()
+    result = engine.record()
     info = engine.info()
     engine.settle()
-    np.savez(order["job"]["result"], pose=pose, velocity=velocity, contacts=contacts)
-    return engine, pose[-1], {"info": info}
+    np.savez(order["job"]["result"], **result)
+    return engine, result["pose"][-1], {"info": info}
 
 
 def timed(engine: Engine, last: np.ndarray) -> dict[str, Any]:
