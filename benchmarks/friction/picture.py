@@ -10,17 +10,22 @@ from typing import Any
 
 from . import summary
 
-#: Line style, marker, width, shade of each curve in order.
-STYLES = (
-    ("-", "o", 2.0, "black"),
-    ("-", "s", 2.0, "black"),
-    ("--", "D", 1.4, "0.25"),
-    ("-", "^", 1.0, "0.45"),
-    ("--", "v", 1.0, "0.45"),
-    ("-.", "<", 1.0, "0.45"),
-    (":", ">", 1.3, "0.35"),
-    ((0, (5, 1, 1, 1, 1, 1)), "x", 1.0, "0.35"),
-)
+#: Line style, width and shade of the curves whose names begin so, and the markers that tell one from the next.
+STYLES = {
+    "warp_lcp": ("-", 2.2, "black", "osD"),
+    "Siconos": ("-", 1.0, "0.5", "^v<>x"),
+    "Pinocchio": ((0, (4, 1.5)), 1.6, "0.2", "Ph*"),
+}
+
+
+def style(place: int, solvers: Sequence[str]) -> dict[str, Any]:
+    """How a curve is drawn, by the first word of its name and how many before it share that."""
+    first = solvers[place].replace(",", "").split()[0]
+    line, width, shade, markers = STYLES[first]
+    own = sum(solver.startswith(first) for solver in solvers[:place])
+    marker = markers[own % len(markers)]
+    filled = shade if own % 2 == 0 or marker == "x" else "white"
+    return {"linestyle": line, "linewidth": width, "color": shade, "marker": marker, "markerfacecolor": filled}
 
 
 def draw(rows: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
@@ -31,25 +36,20 @@ def draw(rows: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
     import matplotlib.pyplot as plt
 
     plt.rcParams["svg.hashsalt"] = "warp_lcp"
-    figure, axes = plt.subplots(1, len(summary.TOLERANCES), figsize=(10.0, 4.6), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, len(summary.TOLERANCES), figsize=(11.0, 5.2), sharey=True, layout="constrained")
     profiles = [summary.profile(summary.times(rows, tolerance)) for tolerance in summary.TOLERANCES]
     limit = 3.0 * max(ratios[-1] for found in profiles for ratios in found.values() if ratios)
     for axis, tolerance, found in zip(axes, summary.TOLERANCES, profiles, strict=True):
         for place, (solver, ratios) in enumerate(found.items()):
-            line, marker, width, shade = STYLES[place]
             shares = [(i + 1) / len(rows) for i in range(len(ratios))]
             x, y = [1.0, *ratios, limit], [0.0, *shares, shares[-1] if shares else 0.0]
             axis.step(
                 x,
                 y,
                 where="post",
-                linestyle=line,
-                linewidth=width,
-                color=shade,
-                marker=marker,
+                **style(place, list(found)),
                 markersize=6,
-                markerfacecolor="white" if place % 2 else shade,
-                markevery=(1 + place % 3, 4),
+                markevery=(1 + place % 4, 4),
                 label=solver,
             )
         axis.set(xscale="log", xlim=(1.0, limit), ylim=(0.0, 1.03), xlabel="time / time of the fastest solver")
