@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,12 @@ from .cases import case_names
 from .peers import compare
 
 
-def peer_names(text: str) -> list[str]:
+def peer_names(text: str, known: Collection[str] = tuple(peers.PEERS)) -> list[str]:
     """'all', 'none' or names with commas between them."""
-    names = {"all": list(peers.PEERS), "none": []}.get(text, text.split(","))
+    names = {"all": list(known), "none": []}.get(text, text.split(","))
     for name in names:
-        if name not in peers.PEERS:
-            raise argparse.ArgumentTypeError(f"no peer {name!r}; choose from {', '.join(peers.PEERS)}, or all, or none")
+        if name not in known:
+            raise argparse.ArgumentTypeError(f"no peer {name!r}; choose from {', '.join(known)}, or all, or none")
     return names
 
 
@@ -54,7 +55,7 @@ def arguments() -> argparse.Namespace:
     )
     recorded = commands.add_parser("lcp", parents=[out, quick], help="every method for LCPs on recorded problems")
     recorded.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
-    cones = commands.add_parser("friction", parents=[out, quick], help="solve_contact on recorded problems, beside Siconos")
+    cones = commands.add_parser("friction", parents=[out, quick, place], help="solve_contact on recorded problems, beside other solvers")
     cones.add_argument("--problems", type=Path, default=friction.PROBLEMS, help="folder of .npz files with W, q, mu")
     cones.add_argument("--siconos", type=Path, default=Path("/usr/bin/python3"), help="Python that has Siconos (default: the system's)")
     cones.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the picture (default: docs)")
@@ -69,16 +70,17 @@ def arguments() -> argparse.Namespace:
     comparison = commands.add_parser("paper", parents=[quick], help="the paper's own comparison: formulations, lead matrices, Fig. 4")
     comparison.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
     others = commands.add_parser("peers", help="other engines on the same scenes").add_subparsers(dest="action", required=True)
-    for action, parents, what in (
-        ("install", [place], "make the interpreters of the peers, with pip"),
-        ("compare", [out, quick, place], "the peers' table of 'speed' alone"),
+    for action, parents, known, what in (
+        ("install", [place], peers.INSTALLABLE, "make the interpreters of the peers, with pip"),
+        ("compare", [out, quick, place], peers.PEERS, "the peers' table of 'speed' alone"),
     ):
         sub = others.add_parser(action, parents=parents, help=what)
-        sub.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(peers.PEERS)} (default: all)")
+        sub.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(known)} (default: all)")
+        sub.set_defaults(known=known)
     found = parser.parse_args()
     if found.what == "peers":
         try:
-            found.names = peer_names(",".join(found.names) or "all")
+            found.names = peer_names(",".join(found.names) or "all", found.known)
         except argparse.ArgumentTypeError as error:
             parser.error(str(error))
     return found
@@ -101,7 +103,7 @@ def main() -> None:
     wp.config.log_level = wp.LOG_WARNING
     if asked.what == "peers" and asked.action == "install":
         for name in asked.names:
-            peers.PEERS[name].install(asked.dir)
+            peers.INSTALLABLE[name].install(asked.dir)
             print(f"{name}: installed in {asked.dir / name}")
         return
     device = wp.get_device("cpu" if asked.what == "peers" else getattr(asked, "device", None))
@@ -149,9 +151,10 @@ def main() -> None:
         print(lcp.markdown(rows))
         data = {"rows": rows}
     elif asked.what == "friction":
-        data, text = friction.run(asked.problems, device, asked.siconos, asked.quick)
+        pythons = {"Siconos": asked.siconos, "Pinocchio": peers.SOLVERS["pin"].python(asked.dir)}
+        data, text = friction.run(asked.problems, device, pythons, asked.quick)
         print(text)
-        if not asked.quick and any(row["siconos"] for row in data.get("recorded", [])):
+        if not asked.quick and any(row["rivals"] for row in data.get("recorded", [])):
             print(f"drawn: {', '.join(str(path) for path in friction.picture.draw(data['recorded'], asked.docs))}")
     else:
         table = [row for precision in ("float64", "float32") for row in resources.measure(precision)]

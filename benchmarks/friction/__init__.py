@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""solve_contact on recorded problems with and without Siconos, facets against the cone, random stress, stages and their floors."""
+"""solve_contact on recorded problems beside other solvers, facets against the cone, random stress, stages and their floors."""
 
 from __future__ import annotations
 
@@ -18,31 +18,34 @@ PROBLEMS = Path("../shared/problems/friction")
 LARGEST = 8  # problems whose stages are measured
 
 
-def measure(problems: list[recorded.Problem], device: wp.Device, python: Path, quick: bool) -> tuple[list[dict[str, Any]], str]:
-    """A row for each problem, and why Siconos is not in it ('' where it is)."""
-    missing, rows = rival.absent(python), []
+def measure(
+    problems: list[recorded.Problem], device: wp.Device, pythons: dict[str, Path], quick: bool
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """A row for each problem, and a line for each rival that is not in it."""
+    missing = {name: rival.RIVALS[name].absent(python) for name, python in pythons.items()}
+    present, rows = [name for name in pythons if not missing[name]], []
     for problem in tqdm(problems, desc="recorded", disable=None):
         row: dict[str, Any] = {"problem": problem.name, "contacts": problem.contacts, "rank": problem.rank}
         row["ours"] = {method: ours.measure(problem, method, device, quick) for method in ours.METHODS}
-        row["siconos"] = [] if missing else summary.relevant(rival.measure(problem, python, quick))
+        row["rivals"] = {name: summary.relevant(rival.RIVALS[name].measure(problem, pythons[name], quick)) for name in present}
         rows.append(row)
-    return rows, missing
+    return rows, [line for line in missing.values() if line]
 
 
-def run(folder: Path, device: wp.Device, python: Path, quick: bool) -> tuple[dict[str, Any], str]:
-    """Everything but the picture; returns data and text."""
+def run(folder: Path, device: wp.Device, pythons: dict[str, Path], quick: bool) -> tuple[dict[str, Any], str]:
+    """Everything but the picture, beside the rivals with these interpreters; returns data and text."""
     data: dict[str, Any] = {}
     text = []
     problems = recorded.find(folder)
     if problems:
-        rows, missing = measure(problems, device, python, quick)
+        rows, missing = measure(problems, device, pythons, quick)
         near = facets.measure(problems, device)
         rate, stages = floor.rates(), [floor.measure(problem, device) for problem in problems[-LARGEST:]]
         data |= {"recorded": rows, "counts": [summary.counts(rows, t) for t in summary.TOLERANCES], "facets": near}
         data |= {"stages": stages, "rates": rate}
         text += [summary.markdown(rows), facets.markdown(near), floor.markdown(stages, rate)]
-        if missing:
-            print(missing, file=sys.stderr)
+        for line in missing:
+            print(line, file=sys.stderr)
     else:
         print(f"{folder} holds no recorded problems (*.npz): only the random ones are solved", file=sys.stderr)
     rows = stress.measure(device, stress.QUICK_COUNT if quick else stress.COUNT)

@@ -26,7 +26,8 @@ def clock(device: wp.Device, action: Callable[[], Any], repetitions: int, second
     """Best and median time of an action [s], the first one not counted; repeated until either limit is reached.
 
     On the CPU a time of over a millisecond is the processor's, if less than by the clock: others may take the processor away.
-    Less than that is left to the median, because virtual processors account for what was taken in lumps.
+    Less than that is left to the median, because virtual processors account for what was taken in lumps: their time may stand still,
+    and no time at all does not count.
     """
     action()
     wp.synchronize_device(device)
@@ -36,8 +37,8 @@ def clock(device: wp.Device, action: Callable[[], Any], repetitions: int, second
         processor, begin = time.process_time(), time.perf_counter()
         action()
         wp.synchronize_device(device)
-        wall = time.perf_counter() - begin
-        times.append(wall if device.is_cuda or wall < 1e-3 else min(wall, time.process_time() - processor))
+        wall, used = time.perf_counter() - begin, time.process_time() - processor
+        times.append(wall if device.is_cuda or wall < 1e-3 else min(wall, used or wall))
     return min(times), statistics.median(times)
 
 

@@ -10,55 +10,68 @@ from typing import Any
 
 from . import summary
 
-#: Line style, marker, width, shade of each curve in order.
-STYLES = (
-    ("-", "o", 2.0, "black"),
-    ("-", "s", 2.0, "black"),
-    ("--", "D", 1.4, "0.25"),
-    ("-", "^", 1.0, "0.45"),
-    ("--", "v", 1.0, "0.45"),
-    ("-.", "<", 1.0, "0.45"),
+#: Line style, marker, width, shade of each curve in order: of ours, and of a rival's.
+OURS = (("-", "o", 2.0, "black"), ("-", "s", 2.0, "black"), ("--", "D", 1.4, "0.25"))
+THEIRS = (
+    ("-", "^", 1.2, "0.4"),
+    ("--", "v", 1.2, "0.4"),
+    ("-.", "<", 1.2, "0.4"),
     (":", ">", 1.3, "0.35"),
-    ((0, (5, 1, 1, 1, 1, 1)), "x", 1.0, "0.35"),
+    ((0, (5, 1, 1, 1, 1, 1)), "x", 1.2, "0.35"),
 )
 
 
+def panel(axis: Any, profiles: dict[str, list[float]], number: int, limit: float) -> None:
+    """Some of the solvers of one tolerance; number: of problems."""
+    ours = [solver for solver in profiles if solver.startswith("warp_lcp")]
+    styles = dict(zip(ours, OURS, strict=True)) | dict(zip([s for s in profiles if s not in ours], THEIRS, strict=False))
+    for place, (solver, ratios) in enumerate(profiles.items()):
+        line, marker, width, shade = styles[solver]
+        shares = [(i + 1) / number for i in range(len(ratios))]
+        axis.step(
+            [1.0, *ratios, limit],
+            [0.0, *shares, shares[-1] if shares else 0.0],
+            where="post",
+            linestyle=line,
+            linewidth=width,
+            color=shade,
+            marker=marker,
+            markersize=6,
+            markerfacecolor="white" if place % 2 else shade,
+            markevery=(1 + place % 3, 4),
+            label=solver,
+        )
+    axis.set(xscale="log", xlim=(1.0, limit), ylim=(0.0, 1.03))
+    axis.grid(True, which="major", color="0.88", linewidth=0.6)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
 def draw(rows: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
-    """Write friction_profile.png and .svg into a folder; one panel for each tolerance. Needs the extra 'bench'."""
+    """Write friction_profile.png and .svg into a folder; a row of panels for each rival beside ours, a column for each tolerance.
+
+    The fastest solver is the fastest of all rows. Needs the extra 'bench'.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     plt.rcParams["svg.hashsalt"] = "warp_lcp"
-    figure, axes = plt.subplots(1, len(summary.TOLERANCES), figsize=(10.0, 4.6), sharey=True, layout="constrained")
+    names = summary.rivals(rows)
+    size = (len(names), len(summary.TOLERANCES))
+    figure, axes = plt.subplots(*size, figsize=(10.0, 4.2 * len(names)), sharex=True, sharey=True, squeeze=False, layout="constrained")
     profiles = [summary.profile(summary.times(rows, tolerance)) for tolerance in summary.TOLERANCES]
     limit = 3.0 * max(ratios[-1] for found in profiles for ratios in found.values() if ratios)
-    for axis, tolerance, found in zip(axes, summary.TOLERANCES, profiles, strict=True):
-        for place, (solver, ratios) in enumerate(found.items()):
-            line, marker, width, shade = STYLES[place]
-            shares = [(i + 1) / len(rows) for i in range(len(ratios))]
-            x, y = [1.0, *ratios, limit], [0.0, *shares, shares[-1] if shares else 0.0]
-            axis.step(
-                x,
-                y,
-                where="post",
-                linestyle=line,
-                linewidth=width,
-                color=shade,
-                marker=marker,
-                markersize=6,
-                markerfacecolor="white" if place % 2 else shade,
-                markevery=(1 + place % 3, 4),
-                label=solver,
-            )
-        axis.set(xscale="log", xlim=(1.0, limit), ylim=(0.0, 1.03), xlabel="time / time of the fastest solver")
+    for line, name in zip(axes, names, strict=True):
+        for axis, found in zip(line, profiles, strict=True):
+            shown = {solver: ratios for solver, ratios in found.items() if solver.startswith(("warp_lcp", name))}
+            panel(axis, shown, len(rows), limit)
+        line[0].set_ylabel(f"share of {len(rows)} problems solved")
+        line[-1].legend(loc="center left", bbox_to_anchor=(1.02, 0.5), frameon=False, handlelength=4.5)
+    for axis, tolerance in zip(axes[0], summary.TOLERANCES, strict=True):
         axis.set_title(f"natural map $\\leq$ $10^{{{round(math.log10(tolerance))}}}$")
-        axis.grid(True, which="major", color="0.88", linewidth=0.6)
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[0].set_ylabel(f"share of {len(rows)} problems solved")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right center", frameon=False, handlelength=4.5)
+    for axis in axes[-1]:
+        axis.set_xlabel("time / time of the fastest solver")
     folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / f"friction_profile.{kind}" for kind in ("png", "svg")]
     figure.savefig(paths[0], dpi=150, metadata={"Software": None})

@@ -2,7 +2,8 @@
 """Other engines on our scenes, each in an interpreter of its own, because their requirements exclude one another.
 
 A peer is an entry of PEERS and a script in adapters/ that its interpreter runs (adapters/protocol.py says what the two sides
-tell each other). `python -m benchmarks peers install` makes the interpreters; a peer without one is left out.
+tell each other). `python -m benchmarks peers install` makes the interpreters; a peer without one is left out. It makes those of
+SOLVERS too, which have no part in the scenes: another benchmark runs them.
 """
 
 from __future__ import annotations
@@ -19,26 +20,18 @@ FOLDER = ROOT / ".peers"
 
 
 @dataclass(frozen=True)
-class Peer:
-    """Another engine.
+class Other:
+    """Something that needs an interpreter of its own.
 
     Attributes:
-        name: in tables, and of its adapter, adapters/on_<name>.py.
-        interpreter: folder of its interpreter; peers that need the same share it.
+        name: in tables.
+        interpreter: folder of its interpreter; those that need the same share it.
         requirements: what pip installs into its interpreter, versions pinned.
-        variants: settings worth comparing, by the name they have in tables; the adapter reads the settings.
-        adapter: the script, if it is elsewhere.
     """
 
     name: str
     interpreter: str
     requirements: tuple[str, ...]
-    variants: dict[str, dict[str, Any]]
-    adapter: Path = field(default=Path())
-
-    def __post_init__(self) -> None:
-        if self.adapter == Path():
-            object.__setattr__(self, "adapter", Path(__file__).parent / "adapters" / f"on_{self.name}.py")
 
     def python(self, folder: Path) -> Path:
         """Its interpreter."""
@@ -67,6 +60,23 @@ class Peer:
         ours = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
         threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
         return ours | threads | {"WARP_CACHE_PATH": str(folder / self.interpreter / "warp_cache")}
+
+
+@dataclass(frozen=True)
+class Peer(Other):
+    """Another engine; its name is also that of its adapter, adapters/on_<name>.py.
+
+    Attributes:
+        variants: settings worth comparing, by the name they have in tables; the adapter reads the settings.
+        adapter: the script, if it is elsewhere.
+    """
+
+    variants: dict[str, dict[str, Any]]
+    adapter: Path = field(default=Path())
+
+    def __post_init__(self) -> None:
+        if self.adapter == Path():
+            object.__setattr__(self, "adapter", Path(__file__).parent / "adapters" / f"on_{self.name}.py")
 
 
 # MuJoCo's default contact is a spring with a time constant of 20 ms; the stiffest that it allows has two steps.
@@ -109,6 +119,9 @@ PEERS = {
         Peer("newton_xpbd", "newton", NEWTON, {f"{n} iterations": {"iterations": n} for n in (2, 10, 20)}),
     )
 }
+#: Run by `python -m benchmarks friction`.
+SOLVERS = {"pin": Other("pin", "pin", ("pin==4.1.0", "scipy==1.17.1"))}
+INSTALLABLE: dict[str, Other] = {**PEERS, **SOLVERS}
 
 
 def split(names: list[str], folder: Path, peers: dict[str, Peer] | None = None) -> tuple[list[Peer], str]:
