@@ -3,7 +3,7 @@
 
 What is added stands on the same ground, FAR away, and never comes near. Then kernels, bytes, rows, time and the motion of the scene
 itself should be what they are without it. What moves by itself has a cost of its own: it is measured as a scene alone, and
-together both should cost no more than the sum. Everything in float64 on the CPU, one thread.
+together both should cost no more than the sum. Everything in float64 on the CPU, which has one thread for all environments.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ FAR = 1000.0
 NOISE = 1.05
 
 #: Quick or not: steps and repetitions of a scene with features; environments, steps (of robust.DT) and repetitions of a shipped one.
-SIZES = {True: (50, 2), False: (250, 5)}
-SHIPPED_SIZES = {True: (16, 60, 2), False: (64, 400, 3)}
+SIZES = {True: (50, 2), False: (200, 3)}
+SHIPPED_SIZES = {True: (16, 60, 2), False: (64, 200, 3)}
 #: Environments: numbers that no array has for another reason (`allocated`), large enough for launches not to count.
 ENVS = {True: {"box": 251, "stack": 37}, False: {"box": 509, "stack": 127}}
-#: A repetition is timed slice by slice, so many env-steps each, and takes the best of so many passes: a machine that is shared stops
-#: for milliseconds, which would hit most passes of a whole run.
-SLICE, PASSES = 2048, 3
+#: A repetition is timed in slices of so many seconds at least, each the best of so many passes, by the clock of the processor time: a
+#: machine that is shared stops for milliseconds, and what others do on it is not ours.
+SLICE, PASSES = 1e-3, 3
 
 
 # ------------------------------------------------------------------------------------------------------------ what is used
@@ -89,9 +89,14 @@ def used(sim: wl.Simulator, steps: int, bodies: int = 0) -> tuple[dict[str, floa
 
 
 def times(sims: Sequence[wl.Simulator], steps: int, repetitions: int) -> np.ndarray:
-    """[repetitions, simulators] seconds an env-step over so many steps from the start, in turns."""
-    cuts = [max(1, SLICE // sim.num_envs) for sim in sims]
-    slices = [[min(cut, steps - k) for k in range(0, steps, cut)] for cut in cuts]
+    """[repetitions, simulators] seconds (of the processor) an env-step over so many steps from the start, in turns."""
+    slices = []
+    for sim in sims:
+        sim.reset()
+        begin = time.process_time()
+        sim.step(steps)  # warms up as well
+        cut = min(steps, int(SLICE * steps / (time.process_time() - begin)) + 1)
+        slices.append([min(cut, steps - k) for k in range(0, steps, cut)])
     result = np.empty((repetitions, len(sims)))
     for i in range(repetitions):
         best = [np.full(len(parts), np.inf) for parts in slices]
@@ -99,9 +104,9 @@ def times(sims: Sequence[wl.Simulator], steps: int, repetitions: int) -> np.ndar
             for sim, parts, least in zip(sims, slices, best, strict=True):
                 sim.reset()
                 for k, part in enumerate(parts):
-                    begin = time.perf_counter()
+                    begin = time.process_time()
                     sim.step(part)
-                    least[k] = min(least[k], time.perf_counter() - begin)
+                    least[k] = min(least[k], time.process_time() - begin)
         result[i] = [least.sum() / (steps * sim.num_envs) for sim, least in zip(sims, best, strict=True)]
     return result
 
@@ -114,9 +119,9 @@ def kernel_times(sims: Sequence[wl.Simulator], steps: int) -> list[dict[str, flo
     def timed(launch: Callable[..., Any]) -> Callable[..., None]:
         def record(kernel: wp.Kernel, *args: Any, **options: Any) -> None:
             command = launch(kernel, *args, **options, record_cmd=True)
-            begin = time.perf_counter()
+            begin = time.process_time()
             command.launch()
-            spent.setdefault(name_of(kernel), np.zeros(steps))[step] += time.perf_counter() - begin
+            spent.setdefault(name_of(kernel), np.zeros(steps))[step] += time.process_time() - begin
 
         return record
 
