@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks accuracy|stability|speed|robust|resources|lcp|friction|paper|peers [--help]"""
+"""python -m benchmarks accuracy|stability|chart|speed|robust|resources|needs|lcp|friction|paper|peers [--help]"""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from . import accuracy, friction, goals, lcp, paper, paper_picture, peers, report, resources, robust, speed, stability, step_floor
+from . import accuracy, friction, goals, lcp, needs, paper, paper_picture, peers, report, resources, robust, speed, stability, step_floor
 from .cases import case_names
 from .peers import compare
 
@@ -67,6 +67,7 @@ def arguments() -> argparse.Namespace:
     crowd.add_argument("--seconds", type=float, default=10.0, help="simulated time (default 10)")
     crowd.add_argument("--device", default=None, help="Warp device (default: Warp's)")
     commands.add_parser("resources", parents=[out], help="what the kernels take of a GPU")
+    commands.add_parser("needs", parents=[out, quick], help="what each scene takes and uses, and what features elsewhere cost it (CPU)")
     comparison = commands.add_parser("paper", parents=[quick], help="the paper's own comparison: formulations, lead matrices, Fig. 4")
     comparison.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
     others = commands.add_parser("peers", help="other engines on the same scenes").add_subparsers(dest="action", required=True)
@@ -106,7 +107,7 @@ def main() -> None:
             peers.INSTALLABLE[name].install(asked.dir)
             print(f"{name}: installed in {asked.dir / name}")
         return
-    device = wp.get_device("cpu" if asked.what == "peers" else getattr(asked, "device", None))
+    device = wp.get_device("cpu" if asked.what in ("peers", "needs") else getattr(asked, "device", None))
     if asked.what == "speed":
         rows = speed.measure(device, quick=asked.quick)
         start = speed.start_up()
@@ -143,6 +144,9 @@ def main() -> None:
         rows = robust.measure(device, asked.scenes, asked.formulations, asked.envs, asked.seconds)
         print(robust.markdown(rows))
         data = {"rows": rows}
+    elif asked.what == "needs":
+        data = needs.measure(asked.quick)
+        print(needs.markdown(data))
     elif asked.what == "lcp":
         try:
             rows = lcp.measure(device, asked.problems, quick=asked.quick)

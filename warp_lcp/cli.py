@@ -157,9 +157,7 @@ def describe(reading: SceneReading, law: Law | None = None) -> dict[str, Any]:
 
 
 def _model_facts(model: Model, law: Law) -> dict[str, Any]:
-    from .methods import LCP_UNKNOWNS
     from .model import JointType, ShapeType
-    from .simulator import kernel_names
 
     bodies, shapes = [], []
     for name, joint, mass in zip(model.body_names, model.joint_type, model.mass, strict=True):
@@ -169,11 +167,19 @@ def _model_facts(model: Model, law: Law) -> dict[str, Any]:
         )
     for name, kind, body in zip(model.shape_names, model.shape_type, model.shape_body, strict=True):
         shapes.append({"name": name, "type": ShapeType(kind).name.lower(), "body": model.body_names[body] if body >= 0 else None})
+    pairs = [[model.shape_names[a], model.shape_names[b]] for a, b in model.pairs]
+    return ledger(model, law) | {"bodies": bodies, "shapes": shapes, "pairs": pairs}
+
+
+def ledger(model: Model, law: Law | None = None) -> dict[str, Any]:
+    """What a model takes under a contact law: degrees of freedom, contact slots, contacts and unknowns of the LCP at most
+    (None where the law is none), bytes of one more environment, names of the kernels."""
+    from .methods import LCP_UNKNOWNS
+    from .simulator import kernel_names
+
+    law = law or Law()
     return {
-        "bodies": bodies,
         "dofs": model.dofs,
-        "shapes": shapes,
-        "pairs": [[model.shape_names[a], model.shape_names[b]] for a, b in model.pairs],
         "contact_slots": model.num_slots,
         "max_contacts": model.max_contacts,
         "largest_lcp": None if law.is_cone else min(model.max_contacts, LCP_UNKNOWNS // law.unknowns) * law.unknowns,
