@@ -236,9 +236,8 @@ def test_absent_peers_are_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["benchmarks", "peers", "compare", "--dir", str(tmp_path), "--out", str(tmp_path / "out")])
     command.main()
     (line,) = capsys.readouterr().out.split("\n")[1:-1]
-    assert line == (
-        "peers not installed: mujoco, mujoco_warp, newton_xpbd (python -m benchmarks peers install mujoco mujoco_warp newton_xpbd)"
-    )
+    names = list(peers.PEERS)
+    assert line == f"peers not installed: {', '.join(names)} (python -m benchmarks peers install {' '.join(names)})"
     assert not (tmp_path / "out").exists()
 
 
@@ -287,7 +286,7 @@ def test_unknown_peer(text, monkeypatch, capsys):
     with pytest.raises(SystemExit) as left:
         command.main()
     assert left.value.code == 2
-    assert "choose from mujoco, mujoco_warp, newton_xpbd, or all, or none" in capsys.readouterr().err
+    assert f"choose from {', '.join(peers.PEERS)}, or all, or none" in capsys.readouterr().err
 
 
 @pytest.mark.slow
