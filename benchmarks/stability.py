@@ -161,10 +161,12 @@ def measure(device: Any, names: list[str], variants: list[Variant], quick: bool)
     for name in names:
         case = CASES[name]
         for h in steps:
-            needs = any(metric.model for metric in case.metrics)
-            exact = case.simulate(h, device=device, formulation="coulomb") if needs else None
+            exact: dict[str, Motion] = {}
             for variant in variants:
-                rows.append(one(case, variant, h, device, exact))
+                integrator = variant.options.get("integrator", "euler")
+                if any(metric.model for metric in case.metrics) and integrator not in exact:
+                    exact[integrator] = case.simulate(h, device=device, formulation="coulomb", integrator=integrator)
+                rows.append(one(case, variant, h, device, exact.get(integrator)))
                 progress.update()
     progress.close()
     return rows
