@@ -37,7 +37,7 @@ def one(case: Case, steps: tuple[float, ...], device: Any) -> list[dict[str, Any
     found: dict[str, list[dict[str, Any]]] = {law: [] for law in LAWS}
     for h in steps:
         runs = {law: case.simulate(h, device=device, **options) for law, options in LAWS.items()}
-        exact = {law: runs["coulomb"] for law in LAWS} | {"midpoint": case.simulate(h, device=device, **LAWS["midpoint"], **EXACT)}
+        exact = dict.fromkeys(LAWS, runs["coulomb"]) | {"midpoint": case.simulate(h, device=device, **LAWS["midpoint"], **EXACT)}
         for law, moved in runs.items():
             for metric in case.metrics:
                 expected, seen, ideal = metric.expected(moved.scene.envs), metric.seen(moved), metric.seen(exact[law])

@@ -15,7 +15,6 @@ before the step; an open one has u_n + gap / h for u_n, as it may close.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -71,7 +70,7 @@ class Step:
         return float(min(2.0 * least_squares(laws, x, x_scale=scale, max_nfev=60, ftol=1e-12, xtol=1e-12, gtol=None).cost for x in starts))
 
 
-def steps(moved: Motion, device: Any = "cpu") -> list[Step]:
+def steps(moved: Motion) -> list[Step]:
     """Some of the steps of a motion whose states one step before each sample are known, spread over it."""
     assert moved.before is not None
     scene, (before_pose, before_velocity) = moved.scene, moved.before
@@ -80,7 +79,7 @@ def steps(moved: Motion, device: Any = "cpu") -> list[Step]:
     envs = np.arange(len(chosen)) % scene.envs
     first: Scene = replace(scene, pose=before_pose[chosen, envs], velocity=before_velocity[chosen, envs])
     after = moved.velocity[chosen + 1, envs].reshape(len(chosen), -1)
-    sim = first.simulator(device=device, formulation="coulomb")
+    sim = first.simulator(device="cpu", formulation="coulomb")
     sim.step()
     c = sim.contacts
     count, bodies, point, gap, frame, impulse = (array.numpy() for array in (c.count, c.bodies, c.point, c.gap, c.frame, c.impulse))

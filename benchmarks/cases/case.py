@@ -60,7 +60,7 @@ class Case:
     """A scene with what is known of it.
 
     Attributes:
-        name: for tables and the command line. title: what happens, in a few words.
+        name: for tables and the command line. title: what happens, in a few words. label: in charts; '': the name.
         build: the scene at a step of h [s], with all its environments.
         metrics: what is known; the first one is what charts show.
         source: where the references come from.
@@ -77,6 +77,7 @@ class Case:
     fails: str = ""
     passive: bool = True
     charted: bool = False
+    label: str = ""
 
     def scene(self, h: float, envs: int | None = None) -> Scene:
         """At a step of h [s], as many environments as it has, or so many."""

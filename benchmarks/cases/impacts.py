@@ -344,6 +344,7 @@ HEAP = Case(
     "rigid bodies do not overlap, and energy only falls; where they end is chance",
     fails="soft contacts and few iterations let them sink into one another",
     charted=True,
+    label="pile of 12",
 )
 
 CASES = (BOUNCING, *CRADLES, FLIP, ROCKING, THIN_PLATE, ROD_SLIDES, *PAINLEVE, HEAP)

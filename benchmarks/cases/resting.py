@@ -39,6 +39,7 @@ def heavy(ratio: float, charted: bool = False) -> Case:
         "it rests; the bar is 0.02 mm, or what Table 1's springs give where that is more",
         fails="sweeps needed grow as 10 times the ratio: iterative methods let it sink through",
         charted=charted,
+        label=f"heavy on light, {ratio:g} : 1",
     )
 
 
@@ -58,6 +59,7 @@ def tower_case(number: int, charted: bool) -> Case:
         "it rests",
         fails="Gauss-Seidel: errors wander up and down the tower",
         charted=charted,
+        label=f"stack of {number}",
     )
 
 

@@ -67,6 +67,7 @@ SLIP_TO_ROLL = Case(
     "(5 v0 + 2 R w0) / 7 from the time 2 |v0 - R w0| / (7 mu g) on",
     fails="explicit friction chatters where slipping ends",
     charted=True,
+    label="slip to roll",
 )
 
 SLOPE, SLOPE_HEADING = 20.0, 30.0

@@ -72,6 +72,7 @@ BOX = Case(
     "planar ODE of the box on four equally compliant corners, exact isotropic friction",
     fails="facets that stay fixed are 2 cm to 0.4 m off (square for cone); convex laws throw it 0.33 m up",
     charted=True,
+    label="paper's box",
 )
 
 # ------------------------------------------------------------------------------------------------------------------ launched
@@ -138,6 +139,7 @@ FAN = Case(
     "v^2 / (2 mu g) in every heading",
     fails="facets: AP with k = 2 stops 41 % too far, facets around the cone 29 % too early; convex laws lift it by 0.3 m",
     charted=True,
+    label="launch fan",
 )
 
 # ---------------------------------------------------------------------------------------------------------------------- spin
@@ -182,6 +184,7 @@ INCLINE_STICK = Case(
     "it rests",
     fails="convex and position-based laws creep; memory of the bristles lost",
     charted=True,
+    label="incline, 0.1° under the friction angle",
 )
 
 SLIDE_OVER = np.radians(FRICTION_ANGLE + 0.1)
@@ -247,6 +250,7 @@ ROLLING_TEST = Case(
     "a = (F - mu (M + n m) g) / (M + 2/7 n m), 2/7 a of every ball",
     fails="square friction limits hold it, convex laws jitter",
     charted=True,
+    label="rolling test (26 bodies)",
 )
 
 # ------------------------------------------------------------------------------------------------------------------ redundant

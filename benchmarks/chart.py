@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Speed against accuracy: ours and every installed engine on the same scenes, steps and start states, one core for all.
+
+A point is an engine's setting at a step size. Its error is that of the case's first metric over a run from beginning to end. Its
+time is the wall time per environment and simulated time, in us per ms: at a step of 1 ms that is the time per step. (Time per
+step alone would make the smallest step the best deal of every engine.) Timed is a batch over the first part of the motion, all
+engines in turns; the energy by which its steps miss the laws (energy_error.py) stands beside.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from . import energy_error
+from .cases import CASES, Case
+from .motion import Motion
+from .peers import Peer, compare
+from .peers.session import PeerError, Refused, Session, Task, session
+from .scenes import Scene
+
+CHARTED = [name for name, case in CASES.items() if case.charted]
+STEPS = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4)
+#: The smallest step of other engines, but for the fastest of them.
+LEAST, LEAST_FAST, FAST = 1e-3, 2e-4, ("mujoco", "newton_xpbd")
+QUICK_STEPS = (1e-2, 2e-3)
+#: Environments that are timed together, where a case is not slow.
+ENVS = {"stack10": 8, "rolling": 8, "heap": 8}
+USUAL_ENVS = 64
+TIMED = 0.2  # s of simulated time that are timed
+REPETITIONS = 3
+PATIENCE = 60.0  # s that a run from beginning to end may be expected to take
+
+
+@dataclass(frozen=True)
+class Ours:
+    """One curve of ours: options that stay, and a knob: the step size, or directions at one step."""
+
+    name: str
+    options: dict[str, Any]
+    directions: tuple[int, ...] = ()
+
+
+OURS = (
+    Ours("default", {}),
+    Ours("midpoint", {"integrator": "midpoint"}),
+    Ours("coulomb", {"formulation": "coulomb"}),
+    Ours("float32", {"precision": "float32"}),
+    Ours("lemke", {"method": "lemke"}),
+    Ours("pgs", {"method": "pgs"}),
+    Ours("AP, k = 2 to 16", {"formulation": "anitescu_potra"}, (2, 4, 8, 16)),
+)
+KNOB_STEP = 1e-3  # s, where the knob is another one
+SLOW = ("lemke",)  # not where there are many contacts
+MANY = ("stack10", "rolling", "heap")
+
+
+def envs(case: str) -> int:
+    """Environments that are timed together."""
+    return ENVS.get(case, USUAL_ENVS)
+
+
+def point(case: Case, moved: Motion, engine: str, setting: str, knob: str, h: float) -> dict[str, Any]:
+    """What is told of one run from beginning to end."""
+    errors = {metric.name: metric.error(moved) for metric in case.metrics}
+    finite = moved.finite
+    return {
+        "case": case.name,
+        "engine": engine,
+        "setting": setting,
+        "knob": knob,
+        "h": h,
+        "error": errors[case.metrics[0].name],
+        "unit": case.metrics[0].unit,
+        "errors": errors,
+        "finite": finite,
+        "contacts": moved.contacts,
+        "E_uc": energy_error.largest(moved),
+        "E_uc_of_a_fall": energy_error.of_a_fall(moved.scene),
+        "energy_rise": case.energy_rise(moved) if finite else None,
+        "certified": moved.certified if len(moved.status) else None,
+        "residual": float(moved.residual.max()) if moved.residual.size else None,
+        "path": path(moved) if (case.name, h) == ("box", KNOB_STEP) else None,
+    }
+
+
+def path(moved: Motion) -> dict[str, list[float]]:
+    """Time [s] and the first body's way [m] in the first environment, for a picture."""
+    numbers = [moved.time, *moved.pose[:, 0, 0, :3].T]
+    return {name: [round(float(x), 6) for x in values] for name, values in zip(("time", "x", "y", "z"), numbers, strict=True)}
+
+
+def part(case: Case, h: float) -> Scene:
+    """The batch that is timed."""
+    scene = case.scene(h, envs(case.name))
+    return replace(scene, steps=min(scene.steps, max(20, round(TIMED / h))))
+
+
+def spread(seconds: list[float], scene: Scene) -> dict[str, float]:
+    """Time per environment and step [s], median of the repetitions, and their range over it."""
+    each = [s / (scene.envs * scene.steps) for s in seconds]
+    median = statistics.median(each)
+    return {"step_s": median, "spread": (max(each) - min(each)) / median, "per_ms_us": 1e6 * median / (1e3 * scene.dt)}
+
+
+Clock = Callable[[], float]
+
+
+def ours_at(case: Case, h: float, device: Any) -> tuple[list[dict[str, Any]], list[Clock]]:
+    """Our points at a step, and what times each of them once."""
+    points, clocks = [], []
+    for curve in OURS:
+        if (curve.directions and h != KNOB_STEP) or (curve.name in SLOW and case.name in MANY):
+            continue
+        for k in curve.directions or (None,):
+            options = curve.options | ({} if k is None else {"directions": k})
+            moved = case.simulate(h, device=device, **options)
+            knob = f"{1e3 * h:g} ms" if k is None else f"k = {k}"
+            points.append(point(case, moved, "warp_lcp", curve.name, knob, h))
+            scene = part(case, h)
+            sim = scene.simulator(device=device, **options)
+
+            def clock(sim=sim, scene=scene) -> float:
+                scene.restart(sim)
+                begin = time.perf_counter()
+                sim.step(scene.steps)
+                sim.q.numpy()
+                return time.perf_counter() - begin
+
+            clock()  # warm
+            clocks.append(clock)
+    return points, clocks
+
+
+def theirs_at(
+    case: Case, h: float, sessions: list[Session], known: dict[tuple[str, str], float]
+) -> tuple[list[dict[str, Any]], list[Task | None]]:
+    """The other engines' points at a step, and the tasks that are timed (None where there is none)."""
+    points, tasks = [], []
+    for each in sessions:
+        for variant in each.peer.variants:
+            name, least = each.peer.name, LEAST_FAST if each.peer.name in FAST else LEAST
+            if h < 0.99 * least:
+                continue
+            scene = case.scene(h)
+            row = {"case": case.name, "engine": name, "setting": variant, "knob": f"{1e3 * h:g} ms", "h": h}
+            expected = known.get((name, variant), 0.0) * scene.steps
+            if expected > PATIENCE:
+                points.append(row | {"left_out": f"a run would take {expected:.0f} s"})
+                tasks.append(None)
+                continue
+            try:
+                begin = time.perf_counter()
+                whole = each.make(variant, scene, case.every(h))
+                known[name, variant] = (time.perf_counter() - begin) / scene.steps
+                before = (whole.before_pose, whole.before_velocity)
+                moved = Motion.of(scene, whole.pose, whole.velocity, whole.contacts, before=before)
+                problems = compare.problems(scene, whole)
+                whole.drop()
+                timed = each.make(variant, part(case, h))
+            except (Refused, PeerError) as why:
+                if each.process.poll() is not None:
+                    raise
+                points.append(row | {"left_out": str(why).strip().splitlines()[-1]})
+                tasks.append(None)
+                continue
+            points.append(point(case, moved, name, variant, row["knob"], h) | {"problems": problems, "versions": each.versions})
+            tasks.append(timed)
+    return points, tasks
+
+
+def at(case: Case, h: float, sessions: list[Session], known: dict[tuple[str, str], float], device: Any) -> list[dict[str, Any]]:
+    """All points of a case at a step, timed in turns."""
+    mine, clocks = ours_at(case, h, device)
+    theirs, tasks = theirs_at(case, h, sessions, known)
+    seconds: list[list[float]] = [[] for _ in clocks]
+    for _ in range(REPETITIONS):
+        for clock, into in zip(clocks, seconds, strict=True):
+            into.append(clock())
+        for task in tasks:
+            if task is not None:
+                task.repeat()
+    scene = part(case, h)
+    for row, measured in zip(mine, seconds, strict=True):
+        row |= spread(measured, scene)
+    for row, task in zip(theirs, tasks, strict=True):
+        if task is not None:
+            row |= spread(task.seconds, scene)
+            row["problems"] += [problem for problem in compare.problems(scene, task) if problem not in row["problems"]]
+            task.drop()
+    return mine + theirs
+
+
+def measure(names: list[str], peers: list[Peer], folder: Path, device: Any, quick: bool) -> list[dict[str, Any]]:
+    """Every case at every step."""
+    rows = []
+    with compare.one_core(), ExitStack() as stack:
+        sessions = [stack.enter_context(session(peer, folder)) for peer in peers]
+        steps = QUICK_STEPS if quick else STEPS
+        progress = tqdm(total=len(names) * len(steps), desc="chart", disable=None)
+        for name in names:
+            known: dict[tuple[str, str], float] = {}
+            for h in steps:
+                rows += at(CASES[name], h, sessions, known, device)
+                progress.update()
+        progress.close()
+    return rows
+
+
+# ------------------------------------------------------------------------------------------------------------------- reports
+
+
+def counts(row: dict[str, Any]) -> bool:
+    """Is the row a point of the chart: simulated, finite, with nothing against it, and certified if it is ours?"""
+    if "left_out" in row or not row["finite"] or row.get("problems"):
+        return False
+    return row["certified"] is None or row["certified"] >= 0.999
+
+
+def front(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those that no other of them beats in both, from fast to slow."""
+    best, kept = np.inf, []
+    for row in sorted(rows, key=lambda row: (row["per_ms_us"], row["error"])):
+        if row["error"] < best:
+            best = row["error"]
+            kept.append(row)
+    return kept
+
+
+def beaten(row: dict[str, Any], mine: list[dict[str, Any]]) -> bool:
+    """Is one of ours both faster and more accurate?"""
+    return any(own["per_ms_us"] < row["per_ms_us"] and own["error"] < row["error"] for own in mine)
+
+
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """Who is on the front of each case, and which points of others none of ours beats in both."""
+    lines = []
+    cases = list(dict.fromkeys(row["case"] for row in rows))
+    engines = [engine for engine in dict.fromkeys(row["engine"] for row in rows) if engine != "warp_lcp"]
+    lines += ["| case | error | front: setting, knob (us/ms, error) |", "| --- | --- | --- |"]
+    good = [row for row in rows if counts(row)]
+    for name in cases:
+        of_case = [row for row in good if row["case"] == name]
+        on = "; ".join(
+            f"{row['engine']} {row['setting']} {row['knob']} ({row['per_ms_us']:.3g}, {row['error']:.1e})" for row in front(of_case)
+        )
+        metric = CASES[name].metrics[0]
+        lines.append(f"| {name} | {metric.name} [{metric.unit}] | {on} |")
+    if engines:
+        lines += ["", "Points of others of which one of ours is both faster and more accurate:", ""]
+        lines += ["| case | " + " | ".join(engines) + " |", "|" + " --- |" * (len(engines) + 1)]
+        for name in cases:
+            mine = [row for row in good if row["case"] == name and row["engine"] == "warp_lcp"]
+            cells = []
+            for engine in engines:
+                theirs = [row for row in good if row["case"] == name and row["engine"] == engine]
+                cells.append(f"{sum(beaten(row, mine) for row in theirs)} of {len(theirs)}" if theirs else "-")
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        lines += ["", "Not beaten:", ""]
+        for name in cases:
+            mine = [row for row in good if row["case"] == name and row["engine"] == "warp_lcp"]
+            for row in good:
+                if row["case"] == name and row["engine"] != "warp_lcp" and not beaten(row, mine):
+                    near = min(mine, key=lambda own: own["error"] if own["per_ms_us"] < row["per_ms_us"] else np.inf, default=None)
+                    faster = near is not None and near["per_ms_us"] < row["per_ms_us"]
+                    beside = f"our best that is faster: {near['error']:.1e}" if faster else "none of ours is faster"
+                    lines.append(
+                        f"- {name}: {row['engine']} {row['setting']}, {row['knob']}: {row['per_ms_us']:.3g} us/ms, "
+                        f"{row['error']:.1e} {row['unit']}; {beside}"
+                    )
+    out = [row for row in rows if not counts(row)]
+    if out:
+        lines += ["", "Not in the chart:", ""]
+        for row in out:
+            why = row.get("left_out") or "; ".join(row.get("problems", [])) or ("not finite" if not row["finite"] else "")
+            why = why or f"{100 * row['certified']:.3g} % certified"
+            lines.append(f"- {row['case']}: {row['engine']} {row['setting']}, {row['knob']}: {why}")
+    return "\n".join(lines)
