@@ -123,6 +123,18 @@ PEERS = {
             },
             KAMINO,
         ),
+        # Its default friction acts at two anchors of a patch, which turn a sliding box too little or too much; with none it acts at
+        # every contact.
+        Peer(
+            "newton_steel",
+            "newton",
+            NEWTON,
+            {
+                "12 sweeps": {},
+                "200 sweeps": {"iterations": 200},
+                "200 sweeps, point friction": {"iterations": 200, "friction_anchor_beta": 0.0},
+            },
+        ),
     )
 }
 
