@@ -93,8 +93,8 @@ PEERS = {
             {"pyramidal": {"cone": "pyramidal"}, "elliptic": {"cone": "elliptic"}},
         ),
         Peer("newton_xpbd", "newton", NEWTON, {f"{n} iterations": {"iterations": n} for n in (2, 10, 20)}),
-        # Its defaults are 200 iterations and nine tenths of the last impulses to start with. Heavy bodies on light ones and stacks
-        # use all iterations: with all of the last impulses they go on where they stopped, which gains more than 2000 iterations.
+        # Its defaults are 200 iterations and nine tenths of the last impulses to start with. A heavy body on a light one uses all of
+        # them; from all of the last impulses it goes on where it stopped, and 500 sink less than 2000 do from nine tenths.
         Peer(
             "newton_padmm",
             "newton",
@@ -123,8 +123,8 @@ PEERS = {
             },
             KAMINO,
         ),
-        # Its default friction acts at two anchors of a patch, which turn a sliding box too little or too much; with none it acts at
-        # every contact.
+        # Its default friction acts at two anchors of a patch, from which the paper's box ends half a metre off, however many sweeps.
+        # With point friction, at every contact, it ends where it should, but a heavy body on a light one drifts more.
         Peer(
             "newton_steel",
             "newton",
