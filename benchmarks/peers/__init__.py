@@ -85,6 +85,7 @@ STIFF = "0.002 1"
 # a fifth of it, and "lagged" throws the paper's box up.
 SAG = 5e-6
 NEWTON = ("newton==1.8.0", "warp-lang==1.19.0")
+KAMINO = Path(__file__).parent / "adapters" / "on_newton_kamino.py"
 PEERS = {
     peer.name: peer
     for peer in (
@@ -117,6 +118,48 @@ PEERS = {
             },
         ),
         Peer("newton_xpbd", "newton", NEWTON, {f"{n} iterations": {"iterations": n} for n in (2, 10, 20)}),
+        # Its defaults are 200 iterations and nine tenths of the last impulses to start with. A heavy body on a light one uses all of
+        # them; from all of the last impulses it goes on where it stopped, and 500 sink less than 2000 do from nine tenths.
+        Peer(
+            "newton_padmm",
+            "newton",
+            NEWTON,
+            {
+                "200 iterations": {"backend": "padmm"},
+                "500 iterations, full warm start": {"backend": "padmm", "max_iterations": 500, "warmstart_scale": 1.0},
+            },
+            KAMINO,
+        ),
+        # Its defaults are 16 iterations and a tolerance of 1e-5 m/s, which in steps of 1 ms is 0.01 m/s^2 of sliding bodies and
+        # stops before iterations run out. The finer one costs little from the velocity that the last impulses predict.
+        Peer(
+            "newton_lox",
+            "newton",
+            NEWTON,
+            {
+                "16 iterations": {"backend": "lox"},
+                "200 iterations": {"backend": "lox", "max_iterations": 200},
+                "200 iterations, 1e-6 m/s": {
+                    "backend": "lox",
+                    "max_iterations": 200,
+                    "velocity_tolerance": 1e-6,
+                    "inertial_warmstart_fraction": 1.0,
+                },
+            },
+            KAMINO,
+        ),
+        # Its default friction acts at two anchors of a patch, from which the paper's box ends half a metre off, however many sweeps.
+        # With point friction, at every contact, it ends where it should, but a heavy body on a light one drifts more.
+        Peer(
+            "newton_steel",
+            "newton",
+            NEWTON,
+            {
+                "12 sweeps": {},
+                "200 sweeps": {"iterations": 200},
+                "200 sweeps, point friction": {"iterations": 200, "friction_anchor_beta": 0.0},
+            },
+        ),
     )
 }
 #: Run by `python -m benchmarks friction`.
