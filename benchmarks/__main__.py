@@ -4,13 +4,31 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from . import accuracy, friction, goals, lcp, needs, paper, paper_picture, peers, report, resources, robust, speed, stability, step_floor
+from . import (
+    accuracy,
+    chart,
+    chart_picture,
+    friction,
+    goals,
+    lcp,
+    needs,
+    paper,
+    paper_picture,
+    peers,
+    report,
+    resources,
+    robust,
+    speed,
+    stability,
+    step_floor,
+)
 from .cases import case_names
 from .peers import compare
 
@@ -46,12 +64,19 @@ def arguments() -> argparse.Namespace:
         "--variants", type=stability.chosen, default="all", metavar="all|NAME;...", help="laws and methods (default: all)"
     )
     breaking.add_argument("--envs", type=int, default=None, help="randomised copies of each case (default 4096; with --quick 64)")
+    charting = commands.add_parser(
+        "chart", parents=[out, quick, which, place], help="speed against accuracy, beside other engines; pictures"
+    )
+    charting.set_defaults(cases=chart.CHARTED)
+    charting.add_argument("--peers", type=peer_names, default=None, metavar="all|none|NAME,...", help="default: all; with --quick: none")
+    charting.add_argument("--data", type=Path, help="draw from these kept results, measure nothing")
+    charting.add_argument("--docs", type=Path, help="folder of the pictures (default: docs; with --quick: that of --out)")
     timing = commands.add_parser(
         "speed", parents=[out, quick, place], help="env-steps/s of the paper's box, start-up, mass ratios, fallback, floors, peers"
     )
     timing.add_argument("--device", default=None, help="Warp device (default: Warp's); peers are compared on the CPU")
     timing.add_argument(
-        "--peers", type=peer_names, default="all", metavar="all|none|NAME,...", help="those that are installed (default: all)"
+        "--peers", type=peer_names, default=",".join(peers.FAST), metavar="all|none|NAME,...", help="default: %(default)s, where installed"
     )
     recorded = commands.add_parser("lcp", parents=[out, quick], help="every method for LCPs on recorded problems")
     recorded.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
@@ -99,6 +124,30 @@ def compared(names: list[str], quick: bool, folder: Path) -> dict[str, Any]:
     return {"peers": rows, "peers_device": report.processor()}
 
 
+def charted(asked: argparse.Namespace, device: wp.Device) -> None:
+    """The chart: measured, unless its data are given, kept after every case, told and drawn."""
+    if asked.data:
+        try:
+            rows = json.loads(asked.data.read_text())["rows"]
+        except (OSError, ValueError, KeyError) as error:
+            raise SystemExit(f"python -m benchmarks: error: {asked.data} holds no data of a chart: {error}") from error
+    else:
+        names = asked.peers if asked.peers is not None else [] if asked.quick else list(peers.PEERS)
+        present, absent = peers.split(names, asked.dir)
+        if absent:
+            print(absent)
+        for rows in chart.measure(asked.cases, present, asked.dir, device, asked.quick):
+            kept = report.write(asked.out, asked.what, device, {"rows": rows})
+        print(f"written to {kept}")
+    print(chart.markdown(rows))
+    folder = asked.docs or (asked.out if asked.quick else Path("docs"))
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = chart_picture.draw(rows, folder / "chart") + chart_picture.draw(rows, folder / "chart_energy", "E_uc")
+    if any(row.get("path") for row in rows):
+        drawn += chart_picture.draw_box(rows, folder / "chart_box")
+    print(f"\ndrawn: {', '.join(str(file) for file in drawn)}")
+
+
 def main() -> None:
     asked = arguments()
     wp.config.log_level = wp.LOG_WARNING
@@ -108,6 +157,9 @@ def main() -> None:
             print(f"{name}: installed in {asked.dir / name}")
         return
     device = wp.get_device("cpu" if asked.what in ("peers", "needs") else getattr(asked, "device", None))
+    if asked.what == "chart":
+        charted(asked, device)
+        return
     if asked.what == "speed":
         rows = speed.measure(device, quick=asked.quick)
         start = speed.start_up()

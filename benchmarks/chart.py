@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -199,9 +199,9 @@ def at(case: Case, h: float, sessions: list[Session], known: dict[tuple[str, str
     return mine + theirs
 
 
-def measure(names: list[str], peers: list[Peer], folder: Path, device: Any, quick: bool) -> list[dict[str, Any]]:
-    """Every case at every step."""
-    rows = []
+def measure(names: list[str], peers: list[Peer], folder: Path, device: Any, quick: bool) -> Iterator[list[dict[str, Any]]]:
+    """Every case at every step; yields all rows that there are whenever a case is done."""
+    rows: list[dict[str, Any]] = []
     with compare.one_core(), ExitStack() as stack:
         sessions = [stack.enter_context(session(peer, folder)) for peer in peers]
         steps = QUICK_STEPS if quick else STEPS
@@ -211,8 +211,8 @@ def measure(names: list[str], peers: list[Peer], folder: Path, device: Any, quic
             for h in steps:
                 rows += at(CASES[name], h, sessions, known, device)
                 progress.update()
+            yield rows
         progress.close()
-    return rows
 
 
 # ------------------------------------------------------------------------------------------------------------------- reports

@@ -96,14 +96,20 @@ PEERS = {
             {
                 "pyramidal": {"cone": "pyramidal"},
                 "elliptic": {"cone": "elliptic"},
+                "elliptic, noslip": {"cone": "elliptic", "noslip_iterations": 10},
                 "elliptic, stiff": {"cone": "elliptic", "solref": STIFF},
+                "elliptic, stiff, noslip": {"cone": "elliptic", "solref": STIFF, "noslip_iterations": 10},
             },
         ),
         Peer(
             "mujoco_warp",
             "mujoco_warp",
             ("mujoco-warp==4.0.0", "mujoco==4.0.0", "warp-lang==1.19.0"),
-            {"pyramidal": {"cone": "pyramidal"}, "elliptic": {"cone": "elliptic"}},
+            {
+                "pyramidal": {"cone": "pyramidal"},
+                "elliptic": {"cone": "elliptic"},
+                "elliptic, stiff": {"cone": "elliptic", "solref": STIFF},
+            },
         ),
         Peer(
             "drake",
@@ -117,7 +123,8 @@ PEERS = {
                 "sap, stiff": {"approximation": "sap", "sag": SAG},
             },
         ),
-        Peer("newton_xpbd", "newton", NEWTON, {f"{n} iterations": {"iterations": n} for n in (2, 10, 20)}),
+        # Its default are 2 iterations; newton's examples take 10 and 20.
+        Peer("newton_xpbd", "newton", NEWTON, {f"{n} iterations": {"iterations": n} for n in (2, 10, 20, 100)}),
         # Its defaults are 200 iterations and nine tenths of the last impulses to start with. A heavy body on a light one uses all of
         # them; from all of the last impulses it goes on where it stopped, and 500 sink less than 2000 do from nine tenths.
         Peer(
@@ -165,6 +172,10 @@ PEERS = {
 #: Run by `python -m benchmarks friction`.
 SOLVERS = {"pin": Other("pin", "pin", ("pin==4.1.0", "scipy==1.17.1"))}
 INSTALLABLE: dict[str, Other] = {**PEERS, **SOLVERS}
+
+
+#: Those whose steps take microseconds: what `speed` compares with. The others' take up to a thousand times as long.
+FAST = ("mujoco", "mujoco_warp", "newton_xpbd")
 
 
 def split(names: list[str], folder: Path, peers: dict[str, Peer] | None = None) -> tuple[list[Peer], str]:
