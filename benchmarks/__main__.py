@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks accuracy|stability|chart|speed|robust|resources|needs|lcp|friction|paper|peers [--help]"""
+"""python -m benchmarks accuracy|stability|chart|speed|peers|friction|lcp|paper|robust|resources|needs|regression|all [--help]"""
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from . import (
     paper,
     paper_picture,
     peers,
+    regression,
     report,
     resources,
     robust,
@@ -29,8 +30,11 @@ from . import (
     stability,
     step_floor,
 )
-from .cases import case_names
+from .cases import CASES, case_names
 from .peers import compare
+
+#: What `all` does, in this order; together they make every number and picture of README and docs.
+EVERYTHING = ("speed", "accuracy", "stability", "chart", "friction", "lcp", "paper", "robust", "resources", "needs")
 
 
 def peer_names(text: str, known: Collection[str] = tuple(peers.PEERS)) -> list[str]:
@@ -42,74 +46,142 @@ def peer_names(text: str, known: Collection[str] = tuple(peers.PEERS)) -> list[s
     return names
 
 
-def arguments() -> argparse.Namespace:
-    """What was asked for."""
+def arguments(words: list[str] | None = None) -> argparse.Namespace:
+    """What was asked for; `run` is the function that does it."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure warp_lcp; results go to a JSON file.")
     out = argparse.ArgumentParser(add_help=False)
     out.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder of the JSON file")
     quick = argparse.ArgumentParser(add_help=False)
-    quick.add_argument("--quick", action="store_true", help="fewer batch sizes and repetitions")
+    quick.add_argument("--quick", action="store_true", help="less of everything, for a look; documents stay as they are")
     place = argparse.ArgumentParser(add_help=False)
     place.add_argument("--dir", type=Path, default=peers.FOLDER, help="folder of the peers' interpreters")
+    device = argparse.ArgumentParser(add_help=False)
+    device.add_argument("--device", default=None, help="Warp device (default: Warp's); other engines run on the CPU")
+    which = argparse.ArgumentParser(add_help=False)
+    which.add_argument(
+        "--cases", type=case_names, default=list(CASES), metavar="all|NAME,...", help="scenes with known outcome (default: all)"
+    )
+    docs = argparse.ArgumentParser(add_help=False)
+    docs.add_argument("--docs", type=Path, help="folder of documents and pictures (default: docs; with --quick: none)")
     commands = parser.add_subparsers(dest="what", required=True)
 
-    which = argparse.ArgumentParser(add_help=False)
-    which.add_argument("--cases", type=case_names, default="all", metavar="all|NAME,...", help="scenes with known outcome (default: all)")
-    which.add_argument("--device", default=None, help="Warp device (default: Warp's)")
-    commands.add_parser("accuracy", parents=[out, quick, which], help="errors of every case against what is known of it, over step sizes")
-    breaking = commands.add_parser(
-        "stability", parents=[out, quick, which], help="which cases break which law, method and precision, and why"
+    def command(
+        name: str, run: Callable[[argparse.Namespace], None], help: str, *parents: argparse.ArgumentParser
+    ) -> argparse.ArgumentParser:
+        made = commands.add_parser(name, parents=list(parents), help=help)
+        made.set_defaults(run=run)
+        return made
+
+    command("accuracy", run_accuracy, "errors of every case against what is known of it, over step sizes", out, quick, which, docs, device)
+    sub = command("stability", run_stability, "which cases break which law, method and precision, and why", out, quick, which, docs, device)
+    sub.add_argument("--variants", type=stability.chosen, default="all", metavar="all|NAME;...", help="laws and methods (default: all)")
+    sub.add_argument("--envs", type=int, default=None, help="randomised copies of each case (default 4096; with --quick 64)")
+    sub = command("chart", run_chart, "speed against accuracy, beside other engines; pictures", out, quick, which, docs, device, place)
+    sub.set_defaults(cases=chart.CHARTED)
+    sub.add_argument("--peers", type=peer_names, default=None, metavar="all|none|NAME,...", help="default: all; with --quick: none")
+    sub.add_argument("--data", type=Path, help="tell and draw these kept results, measure nothing")
+    sub = command(
+        "speed", run_speed, "env-steps/s of the paper's box, start-up, mass ratios, fallback, floors, peers", out, quick, place, device
     )
-    breaking.add_argument(
-        "--variants", type=stability.chosen, default="all", metavar="all|NAME;...", help="laws and methods (default: all)"
-    )
-    breaking.add_argument("--envs", type=int, default=None, help="randomised copies of each case (default 4096; with --quick 64)")
-    charting = commands.add_parser(
-        "chart", parents=[out, quick, which, place], help="speed against accuracy, beside other engines; pictures"
-    )
-    charting.set_defaults(cases=chart.CHARTED)
-    charting.add_argument("--peers", type=peer_names, default=None, metavar="all|none|NAME,...", help="default: all; with --quick: none")
-    charting.add_argument("--data", type=Path, help="draw from these kept results, measure nothing")
-    charting.add_argument("--docs", type=Path, help="folder of the pictures (default: docs; with --quick: that of --out)")
-    timing = commands.add_parser(
-        "speed", parents=[out, quick, place], help="env-steps/s of the paper's box, start-up, mass ratios, fallback, floors, peers"
-    )
-    timing.add_argument("--device", default=None, help="Warp device (default: Warp's); peers are compared on the CPU")
-    timing.add_argument(
+    sub.add_argument(
         "--peers", type=peer_names, default=",".join(peers.FAST), metavar="all|none|NAME,...", help="default: %(default)s, where installed"
     )
-    recorded = commands.add_parser("lcp", parents=[out, quick], help="every method for LCPs on recorded problems")
-    recorded.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
-    cones = commands.add_parser("friction", parents=[out, quick, place], help="solve_contact on recorded problems, beside other solvers")
-    cones.add_argument("--problems", type=Path, default=friction.PROBLEMS, help="folder of .npz files with W, q, mu")
-    cones.add_argument("--siconos", type=Path, default=Path("/usr/bin/python3"), help="Python that has Siconos (default: the system's)")
-    cones.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the picture (default: docs)")
-    cones.add_argument("--device", default=None, help="Warp device (default: Warp's)")
-    crowd = commands.add_parser("robust", parents=[out], help="randomised environments of every shipped scene: what is certified")
-    crowd.add_argument("--scenes", type=lambda text: text.split(","), default=robust.scenes(), metavar="NAME,...", help="default: all")
-    crowd.add_argument("--formulations", type=lambda text: text.split(","), default=["phantom_inertia", "coulomb"], metavar="NAME,...")
-    crowd.add_argument("--envs", type=int, default=4096, help="environments of each scene (default 4096)")
-    crowd.add_argument("--seconds", type=float, default=10.0, help="simulated time (default 10)")
-    crowd.add_argument("--device", default=None, help="Warp device (default: Warp's)")
-    commands.add_parser("resources", parents=[out], help="what the kernels take of a GPU")
-    commands.add_parser("needs", parents=[out, quick], help="what each scene takes and uses, and what features elsewhere cost it (CPU)")
-    comparison = commands.add_parser("paper", parents=[quick], help="the paper's own comparison: formulations, lead matrices, Fig. 4")
-    comparison.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
+    sub = command("friction", run_friction, "solve_contact on recorded problems, beside other solvers", out, quick, place, device)
+    sub.add_argument("--problems", type=Path, default=friction.PROBLEMS, help="folder of .npz files with W, q, mu")
+    sub.add_argument("--siconos", type=Path, default=Path("/usr/bin/python3"), help="Python that has Siconos (default: the system's)")
+    sub.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the picture (default: docs)")
+    sub = command("lcp", run_lcp, "every method for LCPs on recorded problems", out, quick)
+    sub.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
+    sub = command("paper", run_paper, "the paper's own comparison: formulations, lead matrices, Fig. 4", quick)
+    sub.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
+    sub = command("robust", run_robust, "randomised environments of every shipped scene: what is certified", out, device)
+    sub.add_argument("--scenes", type=lambda text: text.split(","), default=robust.scenes(), metavar="NAME,...", help="default: all")
+    sub.add_argument("--formulations", type=lambda text: text.split(","), default=["phantom_inertia", "coulomb"], metavar="NAME,...")
+    sub.add_argument("--envs", type=int, default=4096, help="environments of each scene (default 4096)")
+    sub.add_argument("--seconds", type=float, default=10.0, help="simulated time (default 10)")
+    command("resources", run_resources, "what the kernels take of a GPU", out)
+    command("needs", run_needs, "what each scene takes and uses, and what features elsewhere cost it (CPU)", out, quick)
+    sub = command("regression", run_regression, "what got worse since the result that was kept last; status 1 if anything did")
+    sub.add_argument("new", type=Path, help="JSON file of accuracy, stability, chart, peers or speed")
+    sub.add_argument("old", type=Path, nargs="?", help="what to compare with (default: the one kept last in benchmarks/results)")
+    command("all", run_all, f"one after the other: {', '.join(EVERYTHING)}; some hours", quick)
     others = commands.add_parser("peers", help="other engines on the same scenes").add_subparsers(dest="action", required=True)
-    for action, parents, known, what in (
-        ("install", [place], peers.INSTALLABLE, "make the interpreters of the peers, with pip"),
-        ("compare", [out, quick, place], peers.PEERS, "the peers' table of 'speed' alone"),
+    for action, run, parents, known, what in (
+        ("install", run_install, [place], peers.INSTALLABLE, "make the interpreters of the peers, with pip"),
+        ("compare", run_compare, [out, quick, place], peers.PEERS, "the peers' table of 'speed' alone"),
     ):
         sub = others.add_parser(action, parents=parents, help=what)
         sub.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(known)} (default: all)")
-        sub.set_defaults(known=known)
-    found = parser.parse_args()
+        sub.set_defaults(known=known, run=run)
+    found = parser.parse_args(words)
     if found.what == "peers":
         try:
             found.names = peer_names(",".join(found.names) or "all", found.known)
         except argparse.ArgumentTypeError as error:
             parser.error(str(error))
     return found
+
+
+def keep(asked: argparse.Namespace, device: wp.Device, data: dict[str, Any]) -> Path:
+    """Write the result, and say what got worse since the last one of its kind."""
+    path = report.write(asked.out, asked.what, device, data)
+    print(f"\nwritten to {path}")
+    before = regression.last(path, report.RESULTS) if asked.what in regression.KINDS else None
+    if before:
+        found = regression.worse(before, path)
+        print("\n".join([f"{len(found)} worse than in {before.name}", *found]))
+    return path
+
+
+def documents(asked: argparse.Namespace) -> Path | None:
+    """Folder of the documents that a run writes; None where it leaves them alone."""
+    return asked.docs or (None if asked.quick else report.DOCS)
+
+
+def run_accuracy(asked: argparse.Namespace) -> None:
+    device = wp.get_device(asked.device)
+    rows = accuracy.measure(device, asked.cases, asked.quick)
+    print(accuracy.markdown(rows))
+    keep(asked, device, {"rows": rows})
+    if (folder := documents(asked)) and asked.cases == list(CASES):
+        report.document("accuracy", accuracy.markdown(rows), folder / "accuracy.md")
+
+
+def run_stability(asked: argparse.Namespace) -> None:
+    device = wp.get_device(asked.device)
+    rows = stability.measure(device, asked.cases, asked.variants, asked.quick)
+    crowds = stability.crowd(device, asked.cases, asked.envs or (64 if asked.quick else 4096))
+    print(stability.markdown(rows, crowds))
+    keep(asked, device, {"rows": rows, "crowds": crowds})
+    if (folder := documents(asked)) and asked.cases == list(CASES):
+        report.document("stability", stability.markdown(rows, crowds), folder / "stability.md")
+
+
+def run_chart(asked: argparse.Namespace) -> None:
+    """Measured, unless data are given, kept after every case, told and drawn."""
+    if asked.data:
+        try:
+            rows = json.loads(asked.data.read_text())["rows"]
+        except (OSError, ValueError, KeyError) as error:
+            raise SystemExit(f"python -m benchmarks: error: {asked.data} holds no data of a chart: {error}") from error
+    else:
+        device = wp.get_device(asked.device)
+        names = asked.peers if asked.peers is not None else [] if asked.quick else list(peers.PEERS)
+        present, absent = peers.split(names, asked.dir)
+        if absent:
+            print(absent)
+        for rows in chart.measure(asked.cases, present, asked.dir, device, asked.quick):
+            report.write(asked.out, asked.what, device, {"rows": rows})
+        keep(asked, device, {"rows": rows})
+    print(chart.markdown(rows))
+    if folder := documents(asked):
+        folder.mkdir(parents=True, exist_ok=True)
+        drawn = chart_picture.draw(rows, folder / "chart") + chart_picture.draw(rows, folder / "chart_energy", "E_uc")
+        if any(row.get("path") for row in rows):
+            drawn += chart_picture.draw_box(rows, folder / "chart_box")
+        print(f"\ndrawn: {', '.join(str(file) for file in drawn)}")
+        if {row["case"] for row in rows} == set(chart.CHARTED) and (folder / "chart.md").exists():
+            report.document("chart", chart.markdown(rows), folder / "chart.md")
 
 
 def compared(names: list[str], quick: bool, folder: Path) -> dict[str, Any]:
@@ -124,99 +196,106 @@ def compared(names: list[str], quick: bool, folder: Path) -> dict[str, Any]:
     return {"peers": rows, "peers_device": report.processor()}
 
 
-def charted(asked: argparse.Namespace, device: wp.Device) -> None:
-    """The chart: measured, unless its data are given, kept after every case, told and drawn."""
-    if asked.data:
-        try:
-            rows = json.loads(asked.data.read_text())["rows"]
-        except (OSError, ValueError, KeyError) as error:
-            raise SystemExit(f"python -m benchmarks: error: {asked.data} holds no data of a chart: {error}") from error
-    else:
-        names = asked.peers if asked.peers is not None else [] if asked.quick else list(peers.PEERS)
-        present, absent = peers.split(names, asked.dir)
-        if absent:
-            print(absent)
-        for rows in chart.measure(asked.cases, present, asked.dir, device, asked.quick):
-            kept = report.write(asked.out, asked.what, device, {"rows": rows})
-        print(f"written to {kept}")
-    print(chart.markdown(rows))
-    folder = asked.docs or (asked.out if asked.quick else Path("docs"))
-    folder.mkdir(parents=True, exist_ok=True)
-    drawn = chart_picture.draw(rows, folder / "chart") + chart_picture.draw(rows, folder / "chart_energy", "E_uc")
-    if any(row.get("path") for row in rows):
-        drawn += chart_picture.draw_box(rows, folder / "chart_box")
-    print(f"\ndrawn: {', '.join(str(file) for file in drawn)}")
+def run_speed(asked: argparse.Namespace) -> None:
+    device = wp.get_device(asked.device)
+    rows = speed.measure(device, quick=asked.quick)
+    start = speed.start_up()
+    print(speed.markdown(rows, start))
+    stacks, failures, floors = goals.mass_ratio(asked.quick), goals.fallback(device, asked.quick), step_floor.measure(asked.quick)
+    print(f"\n{goals.markdown(stacks, failures)}\n\n{step_floor.markdown(floors)}")
+    data = {"start_up": start, "rows": rows, "mass_ratio": stacks, "fallback": failures, "step_floor": floors}
+    report.write(asked.out, asked.what, device, data)  # kept if a peer fails
+    keep(asked, device, data | compared(asked.peers, asked.quick, asked.dir))
+
+
+def run_compare(asked: argparse.Namespace) -> None:
+    if data := compared(asked.names, asked.quick, asked.dir):
+        keep(asked, wp.get_device("cpu"), data)
+
+
+def run_install(asked: argparse.Namespace) -> None:
+    for name in asked.names:
+        peers.INSTALLABLE[name].install(asked.dir)
+        print(f"{name}: installed in {peers.INSTALLABLE[name].python(asked.dir).parents[1]}")
+
+
+def run_friction(asked: argparse.Namespace) -> None:
+    device = wp.get_device(asked.device)
+    pythons = {"Siconos": asked.siconos, "Pinocchio": peers.SOLVERS["pin"].python(asked.dir)}
+    data, text = friction.run(asked.problems, device, pythons, asked.quick)
+    print(text)
+    if not asked.quick and any(row["rivals"] for row in data.get("recorded", [])):
+        print(f"drawn: {', '.join(str(path) for path in friction.picture.draw(data['recorded'], asked.docs))}")
+    keep(asked, device, data)
+
+
+def run_lcp(asked: argparse.Namespace) -> None:
+    device = wp.get_device()
+    try:
+        rows = lcp.measure(device, asked.problems, quick=asked.quick)
+    except FileNotFoundError as error:
+        raise SystemExit(f"python -m benchmarks: error: {error}") from error
+    print(lcp.markdown(rows))
+    keep(asked, device, {"rows": rows})
+
+
+def run_paper(asked: argparse.Namespace) -> None:
+    device = wp.get_device()
+    data = paper.measure(device, asked.quick)
+    print(paper.markdown(data))
+    if asked.out or not asked.quick:
+        if asked.out is None:
+            report.document("paper", paper.markdown(data), report.DOCS / "paper.md")
+        else:
+            asked.out.mkdir(parents=True, exist_ok=True)
+        paper_picture.draw(data, (asked.out or report.DOCS) / "paper_comparison")
+    asked.out = asked.out or Path("benchmarks/results")
+    keep(asked, device, data)
+
+
+def run_robust(asked: argparse.Namespace) -> None:
+    device = wp.get_device(asked.device)
+    rows = robust.measure(device, asked.scenes, asked.formulations, asked.envs, asked.seconds)
+    print(robust.markdown(rows))
+    keep(asked, device, {"rows": rows})
+
+
+def run_resources(asked: argparse.Namespace) -> None:
+    table = [row for precision in ("float64", "float32") for row in resources.measure(precision)]
+    print(resources.markdown(table))
+    keep(asked, wp.get_device(), {"rows": [vars(row) for row in table]})
+
+
+def run_needs(asked: argparse.Namespace) -> None:
+    data = needs.measure(asked.quick)
+    print(needs.markdown(data))
+    keep(asked, wp.get_device("cpu"), data)
+
+
+def run_regression(asked: argparse.Namespace) -> None:
+    try:
+        before = asked.old or regression.last(asked.new, report.RESULTS)
+        if before is None:
+            raise ValueError(f"no result of this kind is kept in {report.RESULTS}; name one")
+        found = regression.worse(before, asked.new)
+    except ValueError as error:
+        raise SystemExit(f"python -m benchmarks: error: {error}") from error
+    print("\n".join([f"{len(found)} worse than in {before}", *found]))
+    raise SystemExit(1 if found else 0)
+
+
+def run_all(asked: argparse.Namespace) -> None:
+    for name in EVERYTHING:
+        print(f"\n# {name}\n", flush=True)
+        takes_quick = name not in ("robust", "resources")
+        again = arguments([name, *(["--quick"] if asked.quick and takes_quick else [])])
+        again.run(again)
 
 
 def main() -> None:
     asked = arguments()
     wp.config.log_level = wp.LOG_WARNING
-    if asked.what == "peers" and asked.action == "install":
-        for name in asked.names:
-            peers.INSTALLABLE[name].install(asked.dir)
-            print(f"{name}: installed in {asked.dir / name}")
-        return
-    device = wp.get_device("cpu" if asked.what in ("peers", "needs") else getattr(asked, "device", None))
-    if asked.what == "chart":
-        charted(asked, device)
-        return
-    if asked.what == "speed":
-        rows = speed.measure(device, quick=asked.quick)
-        start = speed.start_up()
-        print(speed.markdown(rows, start))
-        stacks, failures, floors = goals.mass_ratio(asked.quick), goals.fallback(device, asked.quick), step_floor.measure(asked.quick)
-        print(f"\n{goals.markdown(stacks, failures)}\n\n{step_floor.markdown(floors)}")
-        data = {"start_up": start, "rows": rows, "mass_ratio": stacks, "fallback": failures, "step_floor": floors}
-        report.write(asked.out, asked.what, device, data)  # kept if a peer fails
-        data |= compared(asked.peers, asked.quick, asked.dir)
-    elif asked.what == "peers":
-        data = compared(asked.names, asked.quick, asked.dir)
-        if not data:
-            return
-    elif asked.what == "accuracy":
-        rows = accuracy.measure(device, asked.cases, asked.quick)
-        print(accuracy.markdown(rows))
-        data = {"rows": rows}
-    elif asked.what == "stability":
-        rows = stability.measure(device, asked.cases, asked.variants, asked.quick)
-        crowds = stability.crowd(device, asked.cases, asked.envs or (64 if asked.quick else 4096))
-        print(stability.markdown(rows, crowds))
-        data = {"rows": rows, "crowds": crowds}
-    elif asked.what == "paper":
-        data = paper.measure(device, asked.quick)
-        print(paper.markdown(data))
-        if asked.out or not asked.quick:  # a quick run leaves the documents of the repository alone
-            if asked.out is None:
-                paper.document(paper.markdown(data))
-            else:
-                asked.out.mkdir(parents=True, exist_ok=True)
-            paper_picture.draw(data, (asked.out or paper.DOCS) / "paper_comparison")
-        asked.out = asked.out or Path("benchmarks/results")
-    elif asked.what == "robust":
-        rows = robust.measure(device, asked.scenes, asked.formulations, asked.envs, asked.seconds)
-        print(robust.markdown(rows))
-        data = {"rows": rows}
-    elif asked.what == "needs":
-        data = needs.measure(asked.quick)
-        print(needs.markdown(data))
-    elif asked.what == "lcp":
-        try:
-            rows = lcp.measure(device, asked.problems, quick=asked.quick)
-        except FileNotFoundError as error:
-            raise SystemExit(f"python -m benchmarks: error: {error}") from error
-        print(lcp.markdown(rows))
-        data = {"rows": rows}
-    elif asked.what == "friction":
-        pythons = {"Siconos": asked.siconos, "Pinocchio": peers.SOLVERS["pin"].python(asked.dir)}
-        data, text = friction.run(asked.problems, device, pythons, asked.quick)
-        print(text)
-        if not asked.quick and any(row["rivals"] for row in data.get("recorded", [])):
-            print(f"drawn: {', '.join(str(path) for path in friction.picture.draw(data['recorded'], asked.docs))}")
-    else:
-        table = [row for precision in ("float64", "float32") for row in resources.measure(precision)]
-        print(resources.markdown(table))
-        data = {"rows": [vars(row) for row in table]}
-    print(f"\nwritten to {report.write(asked.out, asked.what, device, data)}")
+    asked.run(asked)
 
 
 if __name__ == "__main__":

@@ -93,7 +93,7 @@ def curves(rows: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, A
 
 def panel(axis: Any, rows: list[dict[str, Any]], key: str, least: float, titles: dict[str, str]) -> None:
     """One case: every engine's curves, and the front of them all."""
-    kept = [row | {"error": max(row[key], least)} for row in rows if row.get(key) is not None and np.isfinite(row[key])]
+    kept = [row | {"error": max(row[key], least), "told": title(row)} for row in rows if np.isfinite(row[key])]
     best = front(kept)
     if best:
         x = np.repeat([row["per_ms_us"] for row in best], 2)[1:]
@@ -112,7 +112,7 @@ def panel(axis: Any, rows: list[dict[str, Any]], key: str, least: float, titles:
         axis.plot(x, y, line, color=colour, linewidth=1.0, zorder=order)
         for row, a, b in zip(points, x, y, strict=True):
             name = f"point{len(titles)}"
-            titles[name] = title(row | {"error": row[key]}) if key == "error" else title(next(r for r in rows if r["E_uc"] == row[key]))
+            titles[name] = row["told"]
             axis.plot(a, b, marker, color=colour, markersize=size, markerfacecolor=face, markeredgewidth=1.2, zorder=order + 1, gid=name)
     axis.set_xscale("log")
     axis.set_yscale("log")
@@ -126,14 +126,13 @@ def draw(rows: list[dict[str, Any]], path: Path, key: str = "error") -> list[Pat
     cases = list(dict.fromkeys(row["case"] for row in rows))
     columns = 3
     lines = -(-(len(cases) + 1) // columns)
-    figure, axes = plt.subplots(lines, columns, figsize=(13.0, 4.0 * lines + 1.3), squeeze=False)
+    figure, axes = plt.subplots(lines, columns, figsize=(13.0, 4.2 * lines + 1.2), squeeze=False)
     titles: dict[str, str] = {}
     for axis, name in zip(axes.flat, cases, strict=False):
         panel(axis, [row for row in good if row["case"] == name], key, LEAST_ERROR if key == "error" else LEAST_ENERGY, titles)
         metric = CASES[name].metrics[0]
         axis.set_title(CASES[name].label or name, fontsize=12)
         axis.set_ylabel(f"{metric.name} off by [{metric.unit}]" if key == "error" else "$E_{uc}$, worst step [J]")
-    for axis in axes[-1]:
         axis.set_xlabel("time per environment and simulated ms [µs]")
     summary(axes.flat[len(cases)], good, cases, key)
     for axis in list(axes.flat)[len(cases) + 1 :]:
@@ -149,8 +148,9 @@ def draw(rows: list[dict[str, Any]], path: Path, key: str = "error") -> list[Pat
     for engine, (colour, line, marker, label) in THEIRS.items():
         if engine in {name for name, _ in seen}:
             handles.append(plt.Line2D([], [], color=colour, linestyle=line, marker=marker, markerfacecolor="white", label=label))
+    height, room = figure.get_size_inches()[1], 0.25 * -(-len(handles) // 4) + 0.2  # inches of the legend
     figure.legend(handles=handles, loc="lower center", ncols=4, frameon=False, fontsize=11)
-    figure.tight_layout(rect=(0, 0.035 + 0.02 * (-(-len(handles) // 4)) * 4 / (4.0 * lines + 1.3), 1, 1))
+    figure.tight_layout(rect=(0, room / height, 1, 1), h_pad=1.5)
     files = save(figure, path, titles)
     plt.close(figure)
     return files
@@ -176,6 +176,7 @@ def summary(axis: Any, good: list[dict[str, Any]], cases: list[str], key: str) -
     for y, engine, (both, theirs) in zip(place, engines, shares, strict=True):
         axis.text(0.02, y + 0.36, f"{THEIRS[engine][3]}: {both} of {theirs}", fontsize=10, va="bottom")
     axis.set_yticks([])
+    axis.set_xticks([0, 0.5, 1], ["0", "half", "all"])
     axis.set_xlim(0, 1)
     axis.set_ylim(-0.6, len(engines) - 0.1 if engines else 1)
     axis.set_title("points that one of ours beats in both", fontsize=12)

@@ -85,7 +85,7 @@ def record(sim: wl.Simulator, scene: Scene, every: int = 1, limit: float = math.
     samples, before, watched, contacts = [(sim.q.numpy().copy(), sim.v.numpy().copy())], [], [], []
     for i in range(scene.steps // every):
         if (elapsed := time.perf_counter() - begin) > limit:
-            raise TooSlow(f"{i * every} of {scene.steps} steps after {elapsed:.0f} s, {1e3 * elapsed / (i * every):.2g} ms each")
+            raise TooSlow(f"{i * every} of {scene.steps} steps after {elapsed:.0f} s, {1e3 * elapsed / max(i * every, 1):.2g} ms each")
         run = sim.rollout(every, record=("q", "v", "status", "residual", "iterations"))
         q, v = run.q.numpy(), run.v.numpy()
         before.append((q[-2], v[-2]) if every > 1 else samples[-1])

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import combinations
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,6 @@ from warp_lcp.methods import LCP_METHODS
 from . import lead_matrix as lead
 from .scenes import GRAVITY, scene
 
-DOCS = Path(__file__).parents[1] / "docs"
-BEGIN, END = "<!-- tables of `python -m benchmarks paper` -->\n", "<!-- end of the tables -->\n"
 DURATION = 0.8  # s; the continuous motion rests at 0.661 s
 STIFFNESS = 1e10  # N/m, k_n
 MU, INERTIA, HALF, SPEED, SPIN = 1.0, 1.0 / 6.0, 0.5, 5.0, 2.0 * np.pi  # of the box, m = 1 kg
@@ -453,16 +450,3 @@ def _rho_rows(rows: list[dict[str, Any]]) -> Iterable[str]:
             else:
                 columns += [" / ".join("-" if row["velocity_change"] is None else f"{row['velocity_change']:.0e}" for row in pair)]
             yield f"{case} | {rho:.0e} | " + " | ".join(columns)
-
-
-def document(text: str, path: Path = DOCS / "paper.md") -> None:
-    """Put the tables between their marks in a document.
-
-    Raises:
-        ValueError: if it has no marks.
-    """
-    before, begin, rest = path.read_text().partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
-        raise ValueError(f"{path}: the marks of the tables are missing")
-    path.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}")

@@ -13,6 +13,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+ROOT = Path(__file__).parents[1]
+DOCS, RESULTS = ROOT / "docs", ROOT / "benchmarks" / "results"
+END = "<!-- end of the tables -->\n"
+
 
 def processor() -> str:
     """Model name of the processor."""
@@ -38,3 +42,26 @@ def write(folder: Path, what: str, device: wp.Device, data: dict[str, Any]) -> P
     path = folder / f"{stamp}-{what}-{'cuda' if device.is_cuda else 'cpu'}.json"
     path.write_text(json.dumps(header | data, indent=1) + "\n")
     return path
+
+
+def begin(what: str) -> str:
+    """The mark before the tables of a command."""
+    return f"<!-- tables of `python -m benchmarks {what}` -->\n"
+
+
+def document(what: str, text: str, path: Path) -> None:
+    """Put the tables of a command between their marks in a document.
+
+    Raises:
+        ValueError: if it has no marks.
+    """
+    before, mark, rest = path.read_text().partition(begin(what))
+    _, end, after = rest.partition(END)
+    if not (mark and end):
+        raise ValueError(f"{path}: the marks of the tables of '{what}' are missing")
+    path.write_text(f"{before}{mark}\n{text}\n{end}{after}")
+
+
+def tables(what: str, path: Path) -> str:
+    """What stands there now."""
+    return path.read_text().partition(begin(what))[2].partition(END)[0][1:-1]

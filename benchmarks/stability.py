@@ -103,14 +103,18 @@ VARIANTS = (
 
 
 def judge(case: Case, moved: Motion, h: float, exact: Motion | None) -> tuple[str, str, list[float]]:
-    """Verdict, reason and the errors of the metrics."""
+    """Verdict, reason and the errors of the metrics.
+
+    Raises:
+        ValueError: if a bar is for the error against the exact cone, and its motion is not given.
+    """
     errors = []
     for metric in case.metrics:
+        if metric.model and exact is None:
+            raise ValueError(f"{case.name}: the bar of {metric.name!r} is against the exact cone, whose motion is missing")
         seen = metric.seen(moved)
-        if metric.model:
-            errors.append(float("nan") if exact is None else metric.distance(seen, metric.seen(exact)))
-        else:
-            errors.append(metric.distance(seen, metric.expected(moved.scene.envs)))
+        ideal = metric.seen(exact) if metric.model and exact else metric.expected(moved.scene.envs)
+        errors.append(metric.distance(seen, ideal))
     rise, certified = case.energy_rise(moved), moved.certified
     reasons = [
         f"{metric.name} off by {error:.1e} {metric.unit}, bar {metric.bar(h):.0e}"

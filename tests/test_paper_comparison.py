@@ -9,7 +9,7 @@ import pytest
 from conftest import DEVICE
 
 from benchmarks import lead_matrix as lead
-from benchmarks import paper, paper_picture
+from benchmarks import paper, paper_picture, report
 
 ROOT = Path(__file__).parents[1]
 CASES = {case.name: case for case in (*paper.CASES, *paper.PIVOTED)}
@@ -103,12 +103,12 @@ def test_the_first_block_is_singular_with_more_than_two_directions(k, expected, 
 
 def test_tables_go_between_their_marks(tmp_path):
     path = tmp_path / "paper.md"
-    path.write_text(f"before\n{paper.BEGIN}old\n{paper.END}after\n")
-    paper.document("new", path)
-    assert path.read_text() == f"before\n{paper.BEGIN}\nnew\n{paper.END}after\n"
+    path.write_text(f"before\n{report.begin('paper')}old\n{report.END}after\n")
+    report.document("paper", "new", path)
+    assert path.read_text() == f"before\n{report.begin('paper')}\nnew\n{report.END}after\n"
     path.write_text("no marks\n")
     with pytest.raises(ValueError, match="marks"):
-        paper.document("new", path)
+        report.document("paper", "new", path)
 
 
 def results():
@@ -117,8 +117,7 @@ def results():
 
 
 def test_the_document_holds_the_tables_of_the_results():
-    tables = (ROOT / "docs" / "paper.md").read_text().partition(paper.BEGIN)[2].partition(paper.END)[0]
-    assert tables == f"\n{paper.markdown(results())}\n"
+    assert report.tables("paper", ROOT / "docs" / "paper.md") == paper.markdown(results())
 
 
 def test_the_picture_is_that_of_the_results(tmp_path):

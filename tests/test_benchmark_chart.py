@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The chart: points, front, who beats whom, pictures; what counts as worse than before; the command line. A fake engine stands in."""
+
+import json
+import sys
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_benchmarks import FAKE
+
+from benchmarks import __main__ as command
+from benchmarks import accuracy, chart, chart_picture, peers, regression, report
+from benchmarks.cases import CASES
+
+ROOT = Path(__file__).parents[1]
+
+
+def point(engine="warp_lcp", setting="default", time=1.0, error=1.0, h=1e-2, **more):
+    """A row of the chart: time in us per ms."""
+    row = {"case": "box", "engine": engine, "setting": setting, "knob": f"{1e3 * h:g} ms", "h": h, "error": error, "unit": "m"}
+    row |= {"finite": True, "certified": 1.0 if engine == "warp_lcp" else None, "E_uc": error**2, "residual": None}
+    return row | {"per_ms_us": time, "step_s": 1e-3 * time * h, "spread": 0.1} | more
+
+
+def test_front():
+    """From fast to slow, each better than all that are faster; equal in both counts once."""
+    rows = [point(time=t, error=e) for t, e in [(3, 1), (1, 5), (2, 5), (2, 3), (4, 2), (5, 0.5), (1, 5)]]
+    assert [(row["per_ms_us"], row["error"]) for row in chart.front(rows)] == [(1, 5), (2, 3), (3, 1), (5, 0.5)]
+
+
+def test_beaten_in_both():
+    mine = [point(time=1.0, error=2.0), point(time=3.0, error=1.0)]
+    assert chart.beaten(point("mujoco", time=2.0, error=3.0), mine)
+    assert not chart.beaten(point("mujoco", time=2.0, error=1.5), mine)
+    assert not chart.beaten(point("mujoco", time=0.5, error=9.0), mine)
+    assert not chart.beaten(point("mujoco", time=1.0, error=2.0), mine)
+
+
+@pytest.mark.parametrize(
+    "more", [{"left_out": "slow"}, {"finite": False}, {"problems": ["state not finite"]}, {"certified": 0.99}], ids=lambda more: str(more)
+)
+def test_what_is_no_point_is_told(more):
+    """It is neither drawn nor beaten, and stands in the list with its reason."""
+    row = point("mujoco", "elliptic") | more
+    assert not chart.counts(row)
+    text = chart.markdown([point(), row])
+    reason = {"finite": "not finite", "certified": "99 % certified"}.get(next(iter(more)), "s")
+    assert "Not in the chart:" in text
+    assert reason in text.partition("Not in the chart:")[2]
+
+
+def test_table():
+    rows = [point(), point("mujoco", "pyramidal", 2.0, 3.0), point("mujoco", "elliptic", 0.5, 3.0), point("mujoco", "stiff", 2.0, 0.3)]
+    text = chart.markdown(rows)
+    assert "| box | 1 of 3 |" in text
+    assert "- box: mujoco elliptic, 10 ms: 0.5 us/ms, 3.0e+00 m; none of ours is faster" in text
+    assert "- box: mujoco stiff, 10 ms: 2 us/ms, 3.0e-01 m; our best that is faster: 1.0e+00" in text
+
+
+@pytest.fixture
+def fake(tmp_path) -> peers.Peer:
+    """A peer in tmp_path whose bodies glide on for ever."""
+    (tmp_path / "fake" / "bin").mkdir(parents=True)
+    python = tmp_path / "fake" / "bin" / "python"
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    (tmp_path / "adapter.py").write_text(FAKE)
+    variants = {"plain": {}, "broken": {"fault": "raises"}, "unable": {"fault": "refuses"}, "wild": {"fault": "nan"}}
+    return peers.Peer("fake", "fake", ("fake==1.0",), variants, tmp_path / "adapter.py")
+
+
+def test_measured_points(fake, tmp_path, monkeypatch):
+    """Ours and a peer's on the launched cube: errors by hand, times of both, and what the peer could not do."""
+    monkeypatch.setattr(chart, "QUICK_STEPS", (1e-2,))
+    monkeypatch.setattr(chart, "USUAL_ENVS", 2)
+    (rows,) = chart.measure(["slip_to_roll"], [fake], tmp_path, "cpu", quick=True)
+    mine = {row["setting"]: row for row in rows if row["engine"] == "warp_lcp"}
+    theirs = {row["setting"]: row for row in rows if row["engine"] == "fake"}
+    assert set(mine) == {"default", "midpoint", "coulomb", "float32", "lemke", "pgs"}
+    assert mine["midpoint"]["error"] < 0.02 * mine["default"]["error"]
+    assert mine["coulomb"]["E_uc"] < 1e-12 < theirs["plain"]["E_uc"]
+    # It glides at 2 m/s: from the ball that spins backwards it is farthest.
+    expected = 2.0 * 0.8 - CASES["slip_to_roll"].metrics[0].reference[1, 0]
+    assert theirs["plain"]["error"] == pytest.approx(expected)
+    assert theirs["plain"]["problems"] == []
+    assert "this engine is broken" in theirs["broken"]["left_out"]
+    assert "no such thing" in theirs["unable"]["left_out"]
+    assert "state not finite" in theirs["wild"]["problems"]
+    for row in (*mine.values(), theirs["plain"]):
+        assert row["per_ms_us"] == pytest.approx(1e6 * row["step_s"] / 10.0)
+        assert row["step_s"] > 0.0
+
+
+def test_picture(tmp_path):
+    """The same rows give the same file, other rows another; every point has its title."""
+    pytest.importorskip("matplotlib")
+    rows = [point(), point(setting="midpoint", time=2.0, error=0.1), point("mujoco", "elliptic", 3.0, 0.0)]
+    way = {"time": [0, 1], "x": [0, 1], "y": [0, 2], "z": [0.5, 0.8]}
+    for key in ("error", "E_uc"):
+        png, svg = chart_picture.draw(rows, tmp_path / key, key)
+        first = svg.read_bytes()
+        assert chart_picture.draw(rows, tmp_path / key, key)[1].read_bytes() == first
+        titles = [element.text for element in ElementTree.parse(svg).iter(f"{{{chart_picture.SVG}}}title")]
+        assert len([text for text in titles if text.startswith("warp_lcp")]) == 2
+        assert "mujoco, elliptic, 10 ms: 0.00e+00 m, 3 us/ms, 30 us a step (spread 10 %), E_uc 0.0e+00 J" in titles
+        assert png.stat().st_size > 20_000
+        moved = [*rows[:2], rows[2] | {"per_ms_us": 4.0}]
+        assert chart_picture.draw(moved, tmp_path / key, key)[1].read_bytes() != first
+    files = chart_picture.draw_box([point(path=way), point("mujoco", path=way), point("drake", "sap", path=way)], tmp_path / "box")
+    assert all(file.stat().st_size > 5_000 for file in files)
+
+
+# ---------------------------------------------------------------------------------------------------------------------- regression
+
+
+def test_worse_accuracy():
+    row = {"case": "box", "law": "default", "metric": "x", "unit": "m", "h": [1e-2, 1e-3], "total": [1e-2, 1e-3]}
+    old = {"rows": [row]}
+    assert regression.accuracy(old, old) == []
+    assert regression.accuracy(old, {"rows": [row | {"total": [0.9e-2, 1e-3]}]}) == []
+    assert regression.accuracy(old, {"rows": [row | {"total": [1e-2, 1.2e-3]}]}) == ["box, default, x at 1 ms: 1.20e-03 m, was 1.00e-03"]
+    assert len(regression.accuracy(old, {"rows": [row | {"total": [np.nan, 1e-3]}]})) == 1
+
+
+def test_worse_stability():
+    row = {"case": "box", "variant": "pgs", "h": 1e-2, "verdict": "drifted", "reason": "creep"}
+    crowd = {"scene": "box", "status": {"UNCERTIFIED": 1, "NOT_A_NUMBER": 0}}
+    old = {"rows": [row], "crowds": [crowd]}
+    assert regression.stability(old, old) == []
+    assert regression.stability(old, {"rows": [row | {"verdict": "survived"}]}) == []
+    assert regression.stability(old, {"rows": [row | {"verdict": "wrong"}]}) == ["box, pgs at 10 ms: wrong, was drifted: creep"]
+    assert len(regression.stability(old, {"rows": [row | {"verdict": "too slow"}]})) == 1
+    lost = {"rows": [], "crowds": [{"scene": "box", "status": {"UNCERTIFIED": 1, "NOT_A_NUMBER": 2}}]}
+    assert regression.stability(old, lost) == ["box, randomised: 2 NOT_A_NUMBER, was 0"]
+
+
+def test_worse_chart():
+    """Times count as ratios in a run: a machine of half the speed is not worse."""
+    old = {"rows": [point(), point("mujoco", time=4.0), point(setting="lemke", time=8.0)]}
+    slower = {"rows": [row | {"step_s": 2 * row["step_s"]} for row in old["rows"]]}
+    assert regression.chart(old, slower) == []
+    ours = {"rows": [point(time=2.0), *old["rows"][1:]]}
+    assert regression.chart(old, ours) == ["box, mujoco, default, 10 ms: time over that of our default 2.00, was 4.00"]
+    lemke = {"rows": [*old["rows"][:2], point(setting="lemke", time=16.0)]}
+    assert regression.chart(old, lemke) == ["box, warp_lcp, lemke, 10 ms: time over that of our default 16.00, was 8.00"]
+    off = {"rows": [point(error=1.2), *old["rows"][1:]]}
+    assert regression.chart(old, off) == ["box, warp_lcp, default, 10 ms: error 1.20e+00 m, was 1.00e+00"]
+
+
+def test_worse_peers():
+    row = {"scene": "rest", "engine": "mujoco", "ours_over_peer": 5.0, "ours_over_peer_range": [4.5, 5.5]}
+    old = {"peers": [row]}
+    assert regression.peers(old, {"peers": [row | {"ours_over_peer": 4.0, "ours_over_peer_range": [3.5, 4.6]}]}) == []
+    less = {"peers": [row | {"ours_over_peer": 3.0, "ours_over_peer_range": [2.5, 3.5]}]}
+    assert regression.peers(old, less) == ["rest, mujoco: 3.00 times as fast, was 5.00"]
+
+
+def test_regression_command(tmp_path, monkeypatch, capsys):
+    """Against the last kept result of the same kind; status 1 where something is worse, 2 lines; one line for what cannot be compared."""
+    monkeypatch.setattr(report, "RESULTS", tmp_path)
+    row = {"case": "box", "law": "default", "metric": "x", "unit": "m", "h": [1e-2], "total": [1e-2]}
+    new = tmp_path / "2026-02-01-accuracy-cpu.json"
+    new.write_text(json.dumps({"what": "accuracy", "rows": [row | {"total": [2e-2]}]}))
+
+    def run(*words: str) -> object:
+        monkeypatch.setattr(sys, "argv", ["benchmarks", "regression", *words])
+        with pytest.raises(SystemExit) as left:
+            command.main()
+        return left.value.code
+
+    assert "no result of this kind" in run(str(new))
+    (tmp_path / "2026-01-01-accuracy-cpu.json").write_text(json.dumps({"what": "accuracy", "rows": [row]}))
+    (tmp_path / "2026-01-09-stability-cpu.json").write_text(json.dumps({"what": "stability", "rows": []}))
+    assert run(str(new)) == 1
+    assert "1 worse than in" in capsys.readouterr().out
+    assert run(str(new), str(new)) == 0
+    assert "compare the same" in run(str(new), str(tmp_path / "2026-01-09-stability-cpu.json"))
+    (tmp_path / "x-y-z-accuracy-cpu.json").write_text("{")
+    assert "cannot be read" in run(str(tmp_path / "x-y-z-accuracy-cpu.json"), str(new))
+
+
+# ----------------------------------------------------------------------------------------------------------------- command and documents
+
+
+def test_quick_commands(tmp_path, monkeypatch, capsys):
+    """Run, write their JSON, leave the documents alone."""
+    documents = {path: path.read_bytes() for path in (ROOT / "docs").glob("*")}
+    for words in (
+        ["accuracy", "--cases", "spin"],
+        ["stability", "--cases", "spin", "--variants", "default; AP, k = 2", "--envs", "8"],
+        ["chart", "--cases", "slip_to_roll"],
+    ):
+        monkeypatch.setattr(sys, "argv", ["benchmarks", *words, "--quick", "--out", str(tmp_path)])
+        command.main()
+        assert "spin" in capsys.readouterr().out or words[0] == "chart"
+        (kept,) = tmp_path.glob(f"*-{words[0]}-*.json")
+        assert json.loads(kept.read_text())["rows"]
+    monkeypatch.setattr(sys, "argv", ["benchmarks", "chart", "--data", str(kept), "--docs", str(tmp_path / "drawn")])
+    pytest.importorskip("matplotlib")
+    command.main()
+    assert (tmp_path / "drawn" / "chart.svg").exists()
+    assert documents == {path: path.read_bytes() for path in (ROOT / "docs").glob("*")}
+
+
+def test_chart_of_no_data(tmp_path, monkeypatch):
+    (tmp_path / "x.json").write_text("{}")
+    monkeypatch.setattr(sys, "argv", ["benchmarks", "chart", "--data", str(tmp_path / "x.json")])
+    with pytest.raises(SystemExit, match="holds no data of a chart"):
+        command.main()
+
+
+def last(what: str) -> dict:
+    """The result that is kept."""
+    return json.loads(sorted((ROOT / "benchmarks" / "results").glob(f"*-{what}-cpu.json"))[-1].read_text())
+
+
+@pytest.mark.parametrize("what", ["accuracy", "chart", "stability"])
+def test_documents_hold_the_tables_of_the_results(what):
+    from benchmarks import stability
+
+    data = last(what)
+    made = {
+        "accuracy": lambda: accuracy.markdown(data["rows"]),
+        "chart": lambda: chart.markdown(data["rows"]),
+        "stability": lambda: stability.markdown(data["rows"], data["crowds"]),
+    }[what]()
+    assert report.tables(what, ROOT / "docs" / f"{what}.md") == made
+
+
+def test_picture_in_docs_is_of_the_results(tmp_path):
+    pytest.importorskip("matplotlib")
+    chart_picture.draw(last("chart")["rows"], tmp_path / "chart")
+    assert len((ROOT / "docs" / "chart.svg").read_text().split("<title>")) == len((tmp_path / "chart.svg").read_text().split("<title>"))

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes with known outcome: their references, what is measured of a motion, verdicts, and the energy by which a step misses the laws."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import warp_lcp as wl
+from benchmarks import accuracy, energy_error, motion, scenes, stability
+from benchmarks.cases import CASES, Case, Metric, case, case_names, impacts, resting, rolling, sliding
+from benchmarks.motion import Motion
+
+QUIET = [name for name in CASES if name not in ("stack20", "feet64")]  # those two take seconds and show nothing else
+
+
+@pytest.mark.parametrize("name", QUIET)
+def test_default_survives_at_5_ms(name):
+    """Every step certified, no energy made, every metric within the bar that is stated with the case."""
+    known = CASES[name]
+    moved = known.simulate(5e-3)
+    exact = known.simulate(5e-3, formulation="coulomb") if any(metric.model for metric in known.metrics) else None
+    verdict, reason, _ = stability.judge(known, moved, 5e-3, exact)
+    assert (verdict, reason) == ("survived", "")
+    assert moved.certified == 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("h", [1e-3, 1e-2])
+def test_default_survives_at_other_steps(name, h):
+    known = CASES[name]
+    moved = known.simulate(h)
+    exact = known.simulate(h, formulation="coulomb") if any(metric.model for metric in known.metrics) else None
+    assert stability.judge(known, moved, h, exact)[:2] == ("survived", "")
+
+
+def test_references_of_others(shared):
+    """Closed forms and converged solutions are those that were found independently (references/analytic_scenes.py)."""
+    import importlib.util
+
+    spec = importlib.util.spec_from_file_location("analytic_scenes", shared / "references" / "analytic_scenes.py")
+    other = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(other)
+
+    def reference(name: str, metric: int = 0) -> np.ndarray:
+        return np.asarray(CASES[name].metrics[metric].reference)
+
+    assert reference("launch") == pytest.approx(other.slide_stop(5, 0.8)["x"])
+    assert reference("fan") == pytest.approx(other.slide_stop(6, 0.5)["x"])
+    assert reference("spin") == pytest.approx(other.spin_stop_4pt(2 * np.pi, 1.0, np.sqrt(0.5), 1 / 6)["angle"])
+    assert sliding.ROLLING_A == pytest.approx(other.pushed_box_balls())
+    for spin, speed, time in zip(rolling.SPINS, rolling.ROLLING, rolling.SLIP_TIME, strict=True):
+        found = other.sphere_slip_roll(2.0, 0.3, 0.1, spin)
+        assert (speed, time) == pytest.approx((found["vf"], found["t"]))
+    assert np.linalg.norm(reference("rolling_incline")) == pytest.approx(other.sphere_incline(np.radians(20))["a"])
+    assert reference("bouncing") == pytest.approx(other.bouncing(1.0, 0.8)["peaks"][:3])
+    for number in (3, 5):
+        assert reference(f"cradle{number}_touching") == pytest.approx(other.newton_cradle(number)["simultaneous_newton"])
+        assert reference(f"cradle{number}_gaps") == pytest.approx(other.newton_cradle(number)["sequential"])
+    assert reference("rocking") == pytest.approx(other.rocking_housner(0.1, 0.4)["r_omega"])
+    # An unstable axis: what two integrations at 1e-13 and 2e-14 differ by is 1e-7.
+    assert reference("flip") == pytest.approx(other.dzhanibekov([0.1, 0.2, 0.3], [1e-3, 5.0, 0.0]).y[:, -1], abs=1e-6)
+    assert [other.painleve_rod(impacts.ROD_ANGLE, mu) < 0 for mu in (1.0, 1.4, 2.0)] == [False, True, True]
+    box = np.genfromtxt(shared / "references" / "box_on_ground_reference.csv", delimiter=",", names=True, skip_header=3)[-1]
+    assert sliding.box_reference() == pytest.approx([box["x"], box["y"], box["yaw"]], abs=1e-8)
+
+
+def test_card_threshold():
+    """Moments about the lower ball of a card: at the least friction they vanish, and the forces balance."""
+    lean, half, radius = resting.LEAN, resting.LENGTH, resting.THICK
+    push = resting.CARD_MU  # of a card of unit weight, at its top and, back, at the floor
+    assert push * 2 * half * np.cos(lean) + push * radius == pytest.approx(half * np.sin(lean))
+
+
+def test_scenes_start_in_touch_or_apart():
+    """No case starts with bodies inside one another; a nanometre is round-off of turned corners."""
+    for known in CASES.values():
+        scene = known.scene(1e-2)
+        assert motion.penetration(scene, scene.pose) < 1e-9, known.name
+
+
+def glide(velocity, steps: int = 4) -> Motion:
+    """A free cube that moves with this velocity, sampled at every step."""
+    still = scenes.boxes("glide", [(0.1, 0.1, 0.1)], [2.0], np.zeros((1, 1, 7)), np.zeros((1, 1, 6)), 0.5, 0.1, steps, ())
+    pose, speeds = np.zeros((steps + 1, 1, 1, 7)), np.zeros((steps + 1, 1, 1, 6))
+    pose[..., 6] = 1.0
+    pose[:, 0, 0, :3] = np.arange(steps + 1)[:, None] * 0.1 * np.array(velocity)
+    speeds[..., :3] = velocity
+    return Motion.of(replace(still, pose=pose[0], velocity=speeds[0]), pose, speeds, 0.0)
+
+
+def test_energy_of_a_motion():
+    """Kinetic and of gravity, less the work of constant forces, spin about the body's own axes."""
+    moved = glide((3.0, 0.0, 1.0))
+    fallen = 2.0 * 9.81 * moved.pose[:, :, 0, 2]
+    np.testing.assert_allclose(moved.energy(), 0.5 * 2.0 * 10.0 + fallen)
+    pushed = replace(moved, scene=replace(moved.scene, wrench=np.array([[7.0, 0, 0, 0, 0, 0]])))
+    np.testing.assert_allclose(pushed.energy(), moved.energy() - 7.0 * moved.pose[:, :, 0, 0])
+    spin, turn = np.array([0.0, 4.0, 0.0]), np.array([0, 0, np.sqrt(0.5), np.sqrt(0.5)])  # the body's x axis along y
+    spinning = replace(moved, pose=moved.pose.copy(), velocity=moved.velocity.copy(), scene=replace(moved.scene, gravity=(0, 0, 0)))
+    spinning.velocity[..., :3], spinning.velocity[..., 3:], spinning.pose[..., 3:] = 0.0, spin, turn
+    spinning = replace(spinning, scene=replace(spinning.scene, inertia=np.array([[5.0, 1.0, 1.0]])))
+    np.testing.assert_allclose(spinning.energy(), 0.5 * 5.0 * 16.0)
+
+
+def known_glide(bar: float = 0.1, **more) -> Case:
+    """That a cube glides 0.4 m, known to within the bar."""
+    metric = Metric("way", "m", lambda moved: moved.pose[-1, :, 0, 0], 0.4, lambda h: bar)
+    return Case("glide", "a cube glides", lambda h: glide((1.0, 0, 0)).scene, (metric,), "v t", **more)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "verdict", "said"),
+    [
+        ((1.0, 0, 0), "survived", ""),
+        ((1.5, 0, 0), "drifted", "way off by 2.0e-01 m, bar 1e-01"),
+        ((8.0, 0, 0), "wrong", "way off by 2.8e+00 m, bar 1e-01"),
+        ((np.nan, 0, 0), "blew up", "not a number"),
+    ],
+)
+def test_verdicts(velocity, verdict, said):
+    known = known_glide()
+    moved = replace(glide(velocity), status=np.zeros((4, 1), dtype=int), residual=np.zeros((4, 1)))
+    assert stability.judge(known, moved, 0.1, None)[:2] == (verdict, said)
+
+
+def test_verdict_of_what_is_not_certified():
+    """However good it looks."""
+    status = np.array([[0], [0], [wl.Status.UNCERTIFIED], [0]])
+    moved = replace(glide((1.0, 0, 0)), status=status)
+    assert stability.judge(known_glide(), moved, 0.1, None)[:2] == ("drifted", "75 % certified")
+
+
+def test_verdict_of_what_makes_energy():
+    moved = replace(glide((1.0, 0, 0)), status=np.zeros((4, 1), dtype=int))
+    for factor, verdict, said in ((1.001, "drifted", "energy up by 2.0e-03 of it"), (1.5, "blew up", "energy up by 1.2e+00 of it")):
+        faster = replace(moved, velocity=moved.velocity.copy(), scene=replace(moved.scene, gravity=(0.0, 0.0, 0.0)))
+        faster.velocity[-1] *= factor
+        assert stability.judge(known_glide(), faster, 0.1, None)[:2] == (verdict, said)
+        assert stability.judge(known_glide(passive=False), faster, 0.1, None)[0] == "survived"
+
+
+def test_model_error_is_against_the_same_step():
+    """A bar for the law takes the exact cone's motion as what should come out."""
+    known = known_glide()
+    known = replace(known, metrics=(replace(known.metrics[0], model=True),))
+    moved = replace(glide((2.0, 0, 0)), status=np.zeros((4, 1), dtype=int))
+    assert stability.judge(known, moved, 0.1, glide((2.1, 0, 0)))[0] == "survived"
+    assert stability.judge(known, moved, 0.1, glide((1.0, 0, 0)))[0] == "drifted"
+    with pytest.raises(ValueError, match="exact"):
+        stability.judge(known, moved, 0.1, None)
+
+
+def test_refusals_and_slow_runs_are_told():
+    known = CASES["spin"]
+    refused = stability.one(known, stability.Variant("x", {"method": "velocity_pivoting", "precision": "float32"}), 5e-3, "cpu", None)
+    assert refused["verdict"] == "refused"
+    assert "float32" in refused["reason"]
+    with pytest.raises(motion.TooSlow, match="of 60 steps after"):
+        known.simulate(5e-3, limit=0.0)
+
+
+def test_order_is_of_what_the_step_makes():
+    steps = [1e-2, 1e-3, 1e-4]
+    assert accuracy.order(steps, [1e-1, 1e-2, 1e-3]) == pytest.approx(1.0)
+    assert accuracy.order(steps, [1e-2, 1e-4, 1e-6]) == pytest.approx(2.0)
+    assert accuracy.order(steps, [1e-2, 1e-4, 2e-4]) == pytest.approx(2.0)  # the last one is something else
+    assert accuracy.order(steps, [1e-9, 1e-9, 1e-9]) is None
+    assert accuracy.order(steps, [1e-2, 1e-2, 1e-2]) is None
+    assert accuracy.order(steps, [np.nan, 1e-2, 1e-3]) is None
+
+
+def test_accuracy_tells_the_law_from_the_step():
+    """Of the spinning box all of the error is the step's: the exact cone has it too, and it is of first order."""
+    rows = {row["law"]: row for row in accuracy.one(CASES["spin"], (1e-2, 1e-3), "cpu") if row["metric"] == "stop angle"}
+    assert rows["default"]["order"] == pytest.approx(1.0, abs=0.02)
+    assert max(rows["default"]["model"]) < 1e-4
+    assert rows["coulomb"]["model"] == [0.0, 0.0]
+    assert rows["coulomb"]["discretisation"] == rows["coulomb"]["total"]
+    assert rows["midpoint"]["discretisation"][0] < 0.02 * rows["default"]["discretisation"][0]
+    text = accuracy.markdown(list(rows.values()))
+    assert "| spin | stop angle [rad] | default | 3.1e-02 | 3.1e-03 | 1.00 |" in text
+    assert "**" not in text
+
+
+def test_unknown_cases():
+    import argparse
+
+    with pytest.raises(argparse.ArgumentTypeError, match="no case 'bix'; choose from box, launch"):
+        case_names("box,bix")
+    with pytest.raises(argparse.ArgumentTypeError, match="no variant 'no'; choose from default; coulomb"):
+        stability.chosen("default; no")
+    assert case_names("all") == list(CASES)
+    assert case.steps(1.0, 0.3) == 4
+
+
+# --------------------------------------------------------------------------------------- the energy by which a step misses the laws
+
+
+def sliding_step(after) -> energy_error.Step:
+    """A ball of 2 kg without spin, sliding at 3 m/s on the ground (mu = 0.5), after a step of 10 ms under g = 10 m/s^2."""
+    jacobian = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
+    return energy_error.Step(np.sqrt(2.0) * np.eye(3), jacobian, np.array([3.0, 0, -0.1]), np.array(after), np.zeros(1), 0.5, np.zeros(3))
+
+
+def test_energy_error_of_a_step_by_hand():
+    """Zero for Coulomb's own answer, more for others."""
+    assert sliding_step([2.95, 0, 0]).energy() < 1e-16
+    # No friction: the least over r_n and x of ((r_n - 0.2)^2 + x^2 + (r_n / 2 - x)^2) / 4, momentum in both directions and slip.
+    assert sliding_step([3.0, 0, 0]).energy() == pytest.approx(0.2**2 / 9 / 4, rel=1e-6)
+    # Sinking on: the normal law misses 1/2 m u_n^2 and nothing needs an impulse in the normal direction.
+    assert sliding_step([3.0, 0, -0.1]).energy() == pytest.approx(0.5 * 2.0 * 0.1**2, rel=1e-3)
+    # Thrown up at 1 m/s: the impulse for it misses r_n = 0 instead, half of it each.
+    up = sliding_step([3.0, 0, 1.0]).energy()
+    assert 0.2 < up < 0.5 * 2.0 * 1.1**2
+
+
+def test_energy_error_of_motions():
+    """Of the exact cone round-off; of AP with two directions, much; of a box that falls without a floor under it, nothing."""
+    known = CASES["box"]
+    exact, crude = (energy_error.largest(known.simulate(1e-2, formulation=law)) for law in ("coulomb", "anitescu_potra"))
+    assert exact < 1e-11
+    assert crude > 1e-4
+    scene = replace(known.scene(1e-2), pose=known.scene(1e-2).pose + np.array([0, 0, 50.0, 0, 0, 0, 0]))
+    assert energy_error.largest(motion.simulate(scene, 1)) < 1e-20
+    assert energy_error.of_a_fall(scene) == pytest.approx(0.5 * (9.81 * 0.01) ** 2)
+
+
+def test_states_before_the_samples():
+    """One step before each: of a falling box its speed differs by g h."""
+    known = CASES["launch"].scene(1e-2)
+    scene = replace(known, pose=known.pose + np.array([0, 0, 9.0, 0, 0, 0, 0]), steps=20)
+    for every in (1, 5):
+        moved = motion.simulate(scene, every)
+        before = moved.before[1][..., 2]
+        np.testing.assert_allclose(moved.velocity[1:, ..., 2] - before, -9.81 * 1e-2, rtol=1e-12)
