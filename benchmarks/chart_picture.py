@@ -37,6 +37,17 @@ THEIRS = {
     "drake": ("#cc79a7", "-", "<", "Drake"),
 }
 PEER_SIZE = 5.0
+#: Settings of each engine whose motion of the paper's box is shown.
+SHOWN = {
+    "mujoco": ("pyramidal", "elliptic, stiff"),
+    "mujoco_warp": ("elliptic, stiff",),
+    "drake": ("sap", "lagged"),
+    "newton_steel": ("12 sweeps",),
+    "newton_padmm": ("200 iterations",),
+    "newton_lox": ("16 iterations",),
+    "newton_xpbd": ("10 iterations",),
+    "warp_lcp": ("default",),
+}
 
 
 def pyplot() -> Any:
@@ -84,9 +95,9 @@ def save(figure: Any, path: Path, titles: dict[str, str]) -> list[Path]:
 
 
 def curves(rows: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
-    """Rows of each engine and setting, in the order of their times."""
+    """Rows of each engine and setting, in the order in which their knobs were turned."""
     found: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in sorted(rows, key=lambda row: row["per_ms_us"]):
+    for row in rows:
         found.setdefault((row["engine"], row["setting"]), []).append(row)
     return found
 
@@ -183,34 +194,32 @@ def summary(axis: Any, good: list[dict[str, Any]], cases: list[str], key: str) -
 
 
 def draw_box(rows: list[dict[str, Any]], path: Path) -> list[Path]:
-    """The paper's box at a step of 1 ms: its height over time, and its way seen from above, of every engine's first setting."""
+    """The paper's box at a step of 1 ms: its height over time, and its way seen from above, of every engine."""
     plt = pyplot()
-    paths: dict[str, dict[str, Any]] = {}
-    for row in rows:
-        if row.get("path") and (row["engine"] != "drake" or row["setting"] in ("lagged", "sap")):
-            paths.setdefault(row["engine"] + (row["setting"] if row["engine"] == "drake" else ""), row | row["path"])
-    figure, (side, above) = plt.subplots(1, 2, figsize=(11.0, 4.6), width_ratios=(1.3, 1.0))
+    known = {(row["engine"], row["setting"]): row | row["path"] for row in rows if row.get("path")}
+    paths = [known[key] for key in ((engine, setting) for engine, settings in SHOWN.items() for setting in settings) if key in known]
+    figure, (side, above) = plt.subplots(1, 2, figsize=(11.0, 5.4), width_ratios=(1.6, 1.0))
     titles: dict[str, str] = {}
-    for row in paths.values():
+    for row in paths:
         ours = row["engine"] == "warp_lcp"
         colour, line, label = ("#000000", "-", "warp_lcp") if ours else (*THEIRS[row["engine"]][:2], THEIRS[row["engine"]][3])
         t, x, y, z = (np.array(row[name]) for name in ("time", "x", "y", "z"))
         style = {"color": colour, "linestyle": line, "linewidth": 2.4 if ours else 1.3, "zorder": 5 if ours else 3}
         name = f"path{len(titles)}"
         titles[name] = f"{label}, {row['setting']}: highest {z.max() - z[0]:.2g} m"
-        side.plot(t, z - z[0], gid=name, label=f"{label}, {row['setting']}", **style)
+        side.plot(t, z - z[0], gid=name, label=f"{label}, {row['setting']}: {max(0.0, z.max() - z[0]):.2g} m", **style)
         above.plot(x, y, **style)
         above.plot(x[-1], y[-1], "o", color=colour, markersize=4)
     side.set_xlabel("time [s]")
     side.set_ylabel("height above the ground [m]")
-    side.legend(fontsize=8, frameon=False)
+    figure.legend(loc="lower center", ncols=3, frameon=False, fontsize=9)
     above.plot(0.4406458032, 1.5839676389, "*", color="0.75", markersize=16, markeredgecolor="0.3", zorder=1)
-    above.set_aspect("equal", adjustable="datalim")
+    above.set_aspect("equal", adjustable="box")
     above.set_xlabel("x [m]")
     above.set_ylabel("y [m]")
     above.set_title("from above; star: continuous motion", fontsize=10)
-    side.set_title("the paper's box, h = 1 ms", fontsize=10)
-    figure.tight_layout()
+    side.set_title("the paper's box, h = 1 ms; in the legend the largest height", fontsize=10)
+    figure.tight_layout(rect=(0, 0.16, 1, 1))
     files = save(figure, path, titles)
     plt.close(figure)
     return files

@@ -108,7 +108,7 @@ def test_picture(tmp_path):
         assert png.stat().st_size > 20_000
         moved = [*rows[:2], rows[2] | {"per_ms_us": 4.0}]
         assert chart_picture.draw(moved, tmp_path / key, key)[1].read_bytes() != first
-    files = chart_picture.draw_box([point(path=way), point("mujoco", path=way), point("drake", "sap", path=way)], tmp_path / "box")
+    files = chart_picture.draw_box([point(path=way), point("mujoco", "pyramidal", path=way), point("drake", "sap", path=way)], tmp_path / "box")
     assert all(file.stat().st_size > 5_000 for file in files)
 
 

@@ -49,7 +49,7 @@ def test_references_of_others(shared):
     assert reference("launch") == pytest.approx(other.slide_stop(5, 0.8)["x"])
     assert reference("fan") == pytest.approx(other.slide_stop(6, 0.5)["x"])
     assert reference("spin") == pytest.approx(other.spin_stop_4pt(2 * np.pi, 1.0, np.sqrt(0.5), 1 / 6)["angle"])
-    assert sliding.ROLLING_A == pytest.approx(other.pushed_box_balls())
+    assert float(sliding.ROLLING_A) == pytest.approx(other.pushed_box_balls())
     for spin, speed, time in zip(rolling.SPINS, rolling.ROLLING, rolling.SLIP_TIME, strict=True):
         found = other.sphere_slip_roll(2.0, 0.3, 0.1, spin)
         assert (speed, time) == pytest.approx((found["vf"], found["t"]))
