@@ -28,6 +28,7 @@ from . import (
     robust,
     speed,
     stability,
+    stability_picture,
     step_floor,
 )
 from .cases import CASES, case_names
@@ -74,7 +75,9 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
 
     command("accuracy", run_accuracy, "errors of every case against what is known of it, over step sizes", out, quick, which, docs, device)
     sub = command("stability", run_stability, "which cases break which law, method and precision, and why", out, quick, which, docs, device)
-    sub.add_argument("--variants", type=stability.chosen, default="all", metavar="all|NAME;...", help="laws and methods (default: all)")
+    sub.add_argument(
+        "--variants", type=stability.chosen, metavar="all|some|NAME;...", help="laws and methods (default: all; with --quick: some)"
+    )
     sub.add_argument("--envs", type=int, default=None, help="randomised copies of each case (default 4096; with --quick 64)")
     sub = command("chart", run_chart, "speed against accuracy, beside other engines; pictures", out, quick, which, docs, device, place)
     sub.set_defaults(cases=chart.CHARTED)
@@ -149,12 +152,14 @@ def run_accuracy(asked: argparse.Namespace) -> None:
 
 def run_stability(asked: argparse.Namespace) -> None:
     device = wp.get_device(asked.device)
-    rows = stability.measure(device, asked.cases, asked.variants, asked.quick)
+    variants = asked.variants or stability.chosen("some" if asked.quick else "all")
+    rows = stability.measure(device, asked.cases, variants, asked.quick)
     crowds = stability.crowd(device, asked.cases, asked.envs or (64 if asked.quick else 4096))
     print(stability.markdown(rows, crowds))
     keep(asked, device, {"rows": rows, "crowds": crowds})
     if (folder := documents(asked)) and asked.cases == list(CASES):
         report.document("stability", stability.markdown(rows, crowds), folder / "stability.md")
+        stability_picture.draw(rows, folder / "stability")
 
 
 def run_chart(asked: argparse.Namespace) -> None:

@@ -28,7 +28,7 @@ CERTIFIED = 0.999
 DRIFT = 10.0
 #: The energy, or a number, that nothing comes back from.
 BLOWN = 0.1
-LIMIT_S = 20.0  # of one run
+LIMIT_S, QUICK_LIMIT_S = 20.0, 2.0  # of one run
 VERDICTS = {
     "survived": "S",
     "drifted": "D",
@@ -102,6 +102,9 @@ VARIANTS = (
 )
 
 
+QUICK_VARIANTS = ("default", "coulomb", "AP, k = 4", "box", "lemke", "pgs", "float32")
+
+
 def judge(case: Case, moved: Motion, h: float, exact: Motion | None) -> tuple[str, str, list[float]]:
     """Verdict, reason and the errors of the metrics.
 
@@ -133,11 +136,11 @@ def judge(case: Case, moved: Motion, h: float, exact: Motion | None) -> tuple[st
     return ("wrong" if over > DRIFT else "drifted"), "; ".join(reasons), errors
 
 
-def one(case: Case, variant: Variant, h: float, device: Any, exact: Motion | None) -> dict[str, Any]:
+def one(case: Case, variant: Variant, h: float, device: Any, exact: Motion | None, limit: float = LIMIT_S) -> dict[str, Any]:
     """One run."""
     row: dict[str, Any] = {"case": case.name, "variant": variant.name, "h": h}
     try:
-        moved = case.simulate(h, device=device, material=variant.material, limit=LIMIT_S, **variant.options)
+        moved = case.simulate(h, device=device, material=variant.material, limit=limit, **variant.options)
     except wl.WarpLcpError as why:
         return row | {"verdict": "refused", "reason": str(why)}
     except TooSlow as why:
@@ -170,7 +173,7 @@ def measure(device: Any, names: list[str], variants: list[Variant], quick: bool)
                 integrator = variant.options.get("integrator", "euler")
                 if any(metric.model for metric in case.metrics) and integrator not in exact:
                     exact[integrator] = case.simulate(h, device=device, formulation="coulomb", integrator=integrator)
-                rows.append(one(case, variant, h, device, exact.get(integrator)))
+                rows.append(one(case, variant, h, device, exact.get(integrator), QUICK_LIMIT_S if quick else LIMIT_S))
                 progress.update()
     progress.close()
     return rows
@@ -239,10 +242,10 @@ def markdown(rows: list[dict[str, Any]], crowds: list[dict[str, Any]]) -> str:
 
 
 def chosen(text: str) -> list[Variant]:
-    """'all' or names of variants with semicolons between them (some names have commas)."""
+    """'all', 'some' (QUICK_VARIANTS) or names of variants with semicolons between them (some names have commas)."""
     known = {variant.name: variant for variant in VARIANTS}
-    names = list(known) if text == "all" else [name.strip() for name in text.split(";")]
+    names = list(known) if text == "all" else list(QUICK_VARIANTS) if text == "some" else [name.strip() for name in text.split(";")]
     for name in names:
         if name not in known:
-            raise argparse.ArgumentTypeError(f"no variant {name!r}; choose from {'; '.join(known)}, or all")
+            raise argparse.ArgumentTypeError(f"no variant {name!r}; choose from {'; '.join(known)}, or all, or some")
     return [known[name] for name in names]

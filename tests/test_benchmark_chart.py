@@ -11,7 +11,7 @@ import pytest
 from test_benchmarks import FAKE
 
 from benchmarks import __main__ as command
-from benchmarks import accuracy, chart, chart_picture, peers, regression, report
+from benchmarks import accuracy, chart, chart_picture, peers, regression, report, stability_picture
 from benchmarks.cases import CASES
 
 ROOT = Path(__file__).parents[1]
@@ -108,8 +108,25 @@ def test_picture(tmp_path):
         assert png.stat().st_size > 20_000
         moved = [*rows[:2], rows[2] | {"per_ms_us": 4.0}]
         assert chart_picture.draw(moved, tmp_path / key, key)[1].read_bytes() != first
-    files = chart_picture.draw_box([point(path=way), point("mujoco", "pyramidal", path=way), point("drake", "sap", path=way)], tmp_path / "box")
+    files = chart_picture.draw_box(
+        [point(path=way), point("mujoco", "pyramidal", path=way), point("drake", "sap", path=way)], tmp_path / "box"
+    )
     assert all(file.stat().st_size > 5_000 for file in files)
+
+
+def test_picture_of_stability(tmp_path):
+    """The largest step up to which all are survived: a later success does not count, refusals are apart."""
+    pytest.importorskip("matplotlib")
+    verdicts = {"a": ("survived", "survived", "wrong"), "b": ("drifted", "survived", "survived"), "c": ("refused",) * 3}
+    rows = [
+        {"case": "box", "variant": name, "h": h, "verdict": verdict, "reason": ""}
+        for name, found in verdicts.items()
+        for h, verdict in zip((1e-3, 5e-3, 1e-2), found, strict=True)
+    ]
+    assert stability_picture.survived_to(rows) == {("a", "box"): 5e-3, ("b", "box"): 0.0, ("c", "box"): None}
+    png, svg = stability_picture.draw(rows, tmp_path / "stability")
+    assert png.stat().st_size > 5_000
+    assert svg.stat().st_size > 5_000
 
 
 # ---------------------------------------------------------------------------------------------------------------------- regression
