@@ -69,7 +69,7 @@ def one(case: Case, steps: tuple[float, ...], device: Any) -> list[dict[str, Any
                 row[key] = [line[key] for line in mine]
             row["order"] = order(row["h"], row["total"])
             error = row["model"] if metric.model else row["total"]
-            row["within"] = [e <= bar for e, bar in zip(error, row["bar"], strict=True)]
+            row["within"] = [bool(e <= bar) for e, bar in zip(error, row["bar"], strict=True)]
             rows.append(row)
     return rows
 

@@ -9,6 +9,7 @@ engines in turns; the energy by which its steps miss the laws (energy_error.py) 
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -29,15 +30,17 @@ from .scenes import Scene
 
 CHARTED = [name for name, case in CASES.items() if case.charted]
 STEPS = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4)
-#: The smallest step of other engines, but for the fastest of them.
-LEAST, LEAST_FAST, FAST = 1e-3, 2e-4, ("mujoco", "newton_xpbd")
+#: Smallest steps of other engines: most, those that take microseconds a step, those that take up to milliseconds.
+LEAST = {"mujoco": 2e-4, "newton_xpbd": 2e-4, "newton_padmm": 2e-3, "newton_lox": 2e-3}
+USUAL_LEAST = 1e-3
 QUICK_STEPS = (1e-2, 2e-3)
 #: Environments that are timed together, where a case is not slow.
 ENVS = {"stack10": 8, "rolling": 8, "heap": 8}
 USUAL_ENVS = 64
 TIMED = 0.2  # s of simulated time that are timed
 REPETITIONS = 3
-PATIENCE = 60.0  # s that a run from beginning to end may be expected to take
+PATIENCE = 30.0  # s that a run from beginning to end may be expected to take
+TURN = 2.0  # s that a timed turn is expected to take at most, if that leaves ten steps
 
 
 @dataclass(frozen=True)
@@ -98,10 +101,11 @@ def path(moved: Motion) -> dict[str, list[float]]:
     return {name: [round(float(x), 6) for x in values] for name, values in zip(("time", "x", "y", "z"), numbers, strict=True)}
 
 
-def part(case: Case, h: float) -> Scene:
-    """The batch that is timed."""
+def part(case: Case, h: float, env_step: float = 0.0) -> Scene:
+    """The batch that is timed, if a step of an environment takes about so many seconds."""
     scene = case.scene(h, envs(case.name))
-    return replace(scene, steps=min(scene.steps, max(20, round(TIMED / h))))
+    most = TURN / (env_step * scene.envs) if env_step else math.inf
+    return replace(scene, steps=int(min(scene.steps, max(20, round(TIMED / h)), max(10, most))))
 
 
 def spread(seconds: list[float], scene: Scene) -> dict[str, float]:
@@ -142,13 +146,16 @@ def ours_at(case: Case, h: float, device: Any) -> tuple[list[dict[str, Any]], li
 
 def theirs_at(
     case: Case, h: float, sessions: list[Session], known: dict[tuple[str, str], float]
-) -> tuple[list[dict[str, Any]], list[Task | None]]:
-    """The other engines' points at a step, and the tasks that are timed (None where there is none)."""
+) -> tuple[list[dict[str, Any]], list[tuple[Task, Scene] | None]]:
+    """The other engines' points at a step, and what is timed (None where there is nothing).
+
+    known: seconds of a step of a run from beginning to end, by engine and setting; at larger steps before, at this one after.
+    """
     points, tasks = [], []
     for each in sessions:
         for variant in each.peer.variants:
-            name, least = each.peer.name, LEAST_FAST if each.peer.name in FAST else LEAST
-            if h < 0.99 * least:
+            name = each.peer.name
+            if h < 0.99 * LEAST.get(name, USUAL_LEAST):
                 continue
             scene = case.scene(h)
             row = {"case": case.name, "engine": name, "setting": variant, "knob": f"{1e3 * h:g} ms", "h": h}
@@ -165,7 +172,8 @@ def theirs_at(
                 moved = Motion.of(scene, whole.pose, whole.velocity, whole.contacts, before=before)
                 problems = compare.problems(scene, whole)
                 whole.drop()
-                timed = each.make(variant, part(case, h))
+                short = part(case, h, known[name, variant] / scene.envs)
+                timed = (each.make(variant, short), short)
             except (Refused, PeerError) as why:
                 if each.process.poll() is not None:
                     raise
@@ -187,14 +195,15 @@ def at(case: Case, h: float, sessions: list[Session], known: dict[tuple[str, str
             into.append(clock())
         for task in tasks:
             if task is not None:
-                task.repeat()
+                task[0].repeat()
     scene = part(case, h)
     for row, measured in zip(mine, seconds, strict=True):
         row |= spread(measured, scene)
-    for row, task in zip(theirs, tasks, strict=True):
-        if task is not None:
-            row |= spread(task.seconds, scene)
-            row["problems"] += [problem for problem in compare.problems(scene, task) if problem not in row["problems"]]
+    for row, pair in zip(theirs, tasks, strict=True):
+        if pair is not None:
+            task, short = pair
+            row |= spread(task.seconds, short)
+            row["problems"] += [problem for problem in compare.problems(short, task) if problem not in row["problems"]]
             task.drop()
     return mine + theirs
 
