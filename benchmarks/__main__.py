@@ -79,8 +79,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
         "--variants", type=stability.chosen, metavar="all|some|NAME;...", help="laws and methods (default: all; with --quick: some)"
     )
     sub.add_argument("--envs", type=int, default=None, help="randomised copies of each case (default 4096; with --quick 64)")
-    sub = command("chart", run_chart, "speed against accuracy, beside other engines; pictures", out, quick, which, docs, device, place)
-    sub.set_defaults(cases=chart.CHARTED)
+    sub = command("chart", run_chart, "speed against accuracy, beside other engines; pictures", out, quick, charted, docs, device, place)
     sub.add_argument("--peers", type=peer_names, default=None, metavar="all|none|NAME,...", help="default: all; with --quick: none")
     sub.add_argument("--data", type=Path, help="tell and draw these kept results, measure nothing")
     sub = command(

@@ -250,3 +250,9 @@ def test_picture_in_docs_is_of_the_results(tmp_path):
     pytest.importorskip("matplotlib")
     chart_picture.draw(last("chart")["rows"], tmp_path / "chart")
     assert len((ROOT / "docs" / "chart.svg").read_text().split("<title>")) == len((tmp_path / "chart.svg").read_text().split("<title>"))
+
+
+def test_cases_that_are_taken_without_being_named():
+    """All of them, but for the chart."""
+    assert command.arguments(["accuracy"]).cases == command.arguments(["stability"]).cases == list(CASES)
+    assert command.arguments(["chart"]).cases == chart.CHARTED
