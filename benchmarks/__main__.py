@@ -58,10 +58,9 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     place.add_argument("--dir", type=Path, default=peers.FOLDER, help="folder of the peers' interpreters")
     device = argparse.ArgumentParser(add_help=False)
     device.add_argument("--device", default=None, help="Warp device (default: Warp's); other engines run on the CPU")
-    which = argparse.ArgumentParser(add_help=False)
-    which.add_argument(
-        "--cases", type=case_names, default=list(CASES), metavar="all|NAME,...", help="scenes with known outcome (default: all)"
-    )
+    which, few = (argparse.ArgumentParser(add_help=False) for _ in range(2))  # what a parser shares it shares with its defaults
+    for parent, usual, said in ((which, list(CASES), "all"), (few, chart.CHARTED, ",".join(chart.CHARTED))):
+        parent.add_argument("--cases", type=case_names, default=usual, metavar="all|NAME,...", help=f"with known outcome (default: {said})")
     docs = argparse.ArgumentParser(add_help=False)
     docs.add_argument("--docs", type=Path, help="folder of documents and pictures (default: docs; with --quick: none)")
     commands = parser.add_subparsers(dest="what", required=True)
@@ -79,7 +78,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
         "--variants", type=stability.chosen, metavar="all|some|NAME;...", help="laws and methods (default: all; with --quick: some)"
     )
     sub.add_argument("--envs", type=int, default=None, help="randomised copies of each case (default 4096; with --quick 64)")
-    sub = command("chart", run_chart, "speed against accuracy, beside other engines; pictures", out, quick, charted, docs, device, place)
+    sub = command("chart", run_chart, "speed against accuracy, beside other engines; pictures", out, quick, few, docs, device, place)
     sub.add_argument("--peers", type=peer_names, default=None, metavar="all|none|NAME,...", help="default: all; with --quick: none")
     sub.add_argument("--data", type=Path, help="tell and draw these kept results, measure nothing")
     sub = command(
