@@ -229,7 +229,7 @@ class Simulator:
 
         What follows from a parameter follows at once: inverse masses, the scaling of Table 1, the coefficients of a
         pair. ``mass`` without ``inertia`` is a body of the same shape and another density: its inertia scales along.
-        Where the model has no restitution, the first one above zero loads the kernels that it needs.
+        Where no pair of the model bounces, the first that does loads the kernels that it needs.
 
         Raises:
             WarpLcpError: for an unknown name, a wrong shape, or a number that no body or contact can have.
@@ -263,10 +263,10 @@ class Simulator:
             self._graphs.clear()  # they hold the address of the old array
 
     def _set_restitution(self, value: np.ndarray) -> None:
-        """[1|E, S] e of the shapes. While all are zero, and always were, nothing of restitution exists."""
+        """[1|E, S] e of the shapes. While no pair has any, and never had, nothing of restitution exists."""
         if self.bounces is not None:
             self._set_constant(self.bounces, "coefficient", value)
-        elif value.any():
+        elif value[:, self.model.pairs].any():
             k = restitution.make(self.real)
             self._kernels.bounce, self._kernels.judge, self._kernels.settle = k.bounce, k.judge, k.settle
             bounces = self.bounces = k.Bounces()
@@ -552,7 +552,7 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     )
     if not without_rows:
         stages.contact_rows = rows.contact_rows
-    if model.restitution.any():
+    if model.bounces:
         rebound = restitution.make(real)
         stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
     if integrator == "midpoint":
