@@ -324,23 +324,24 @@ def make(real) -> SimpleNamespace:
     def combine_pairs(topology: Topology, parameters: Parameters):
         """Friction and contact parameters of every pair: the mean of its two shapes' materials, or Table 1."""
         i, pair = wp.tid()
-        mass = real(0.0)  # of the lighter movable body
-        for side in range(2):
-            b = topology.pair_body[pair][side]
-            if b >= 0 and topology.joint_type[wp.max(b, 0)] == FREE:
-                m = parameters.mass[i % parameters.mass.shape[0], b]
-                if mass == real(0.0) or m < mass:
-                    mass = m
         a = topology.pairs[pair, 0]
         b = topology.pairs[pair, 1]
-        e = i % parameters.friction.shape[0]
-        parameters.pair_friction[i, pair] = real(0.5) * (parameters.friction[e, a] + parameters.friction[e, b])
-        c_a = vec5()
-        c_b = vec5()
-        for k in range(5):
-            c_a[k] = parameters.contact[i % parameters.contact.shape[0], a, k]
-            c_b[k] = parameters.contact[i % parameters.contact.shape[0], b, k]
-        parameters.pair_contact[i, pair] = contact_parameters(c_a, c_b, mass)
+        if i < parameters.pair_friction.shape[0]:
+            parameters.pair_friction[i, pair] = real(0.5) * (parameters.friction[i, a] + parameters.friction[i, b])
+        if i < parameters.pair_contact.shape[0]:
+            mass = real(0.0)  # of the lighter movable body
+            for side in range(2):
+                body = topology.pair_body[pair][side]
+                if body >= 0 and topology.joint_type[wp.max(body, 0)] == FREE:
+                    m = parameters.mass[i % parameters.mass.shape[0], body]
+                    if mass == real(0.0) or m < mass:
+                        mass = m
+            c_a = vec5()
+            c_b = vec5()
+            for k in range(5):
+                c_a[k] = parameters.contact[i % parameters.contact.shape[0], a, k]
+                c_b[k] = parameters.contact[i % parameters.contact.shape[0], b, k]
+            parameters.pair_contact[i, pair] = contact_parameters(c_a, c_b, mass)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def select_contacts(

@@ -150,8 +150,8 @@ def test_comparison_says_what_changed(monkeypatch, name):
         "its mass randomised": {"bytes"},
     }[name]
     assert set(needs.changed(row)) - {"time"} == expected
-    # Of its own: mass and inertia of two bodies, coefficients and parameters of three pairs.
-    own = 2 * (8 + 72) + 3 * (2 + 5) * 8 if feature.change else 0
+    # Of its own: mass and inertia of two bodies, contact parameters of three pairs.
+    own = 2 * (8 + 72) + 3 * 5 * 8 if feature.change else 0
     assert row["bytes"] == facts["bytes_per_env"] + own
     assert row["bytes_expected"] == row["bytes_base"] + (ledger(model(None, feature))["bytes_per_env"] if feature.moves else 0)
     assert row["kernels_less"] == (["solve_single"] if feature.moves else [])

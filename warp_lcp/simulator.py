@@ -247,12 +247,13 @@ class Simulator:
     def _combine_pairs(self) -> None:
         """Friction and contact parameters of the pairs, from those of their shapes and bodies."""
         p, t, pairs = self.parameters, self._types, len(self.model.pairs)
-        rows = max(p.mass.shape[0], p.friction.shape[0], p.contact.shape[0])
-        if p.pair_contact is None or p.pair_contact.shape != (rows, pairs):
-            p.pair_friction = wp.empty((rows, pairs), dtype=t.vec2, device=self.device)
-            p.pair_contact = wp.empty((rows, pairs), dtype=t.vec5, device=self.device)
-            self._graphs.clear()
-        wp.launch(self._kernels.combine_pairs, dim=(rows, pairs), inputs=[self.topology, p], device=self.device)
+        rows = {"pair_friction": p.friction.shape[0], "pair_contact": max(p.mass.shape[0], p.contact.shape[0])}
+        for name, dtype in (("pair_friction", t.vec2), ("pair_contact", t.vec5)):
+            present = getattr(p, name)
+            if present is None or present.shape != (rows[name], pairs):
+                setattr(p, name, wp.empty((rows[name], pairs), dtype=dtype, device=self.device))
+                self._graphs.clear()
+        wp.launch(self._kernels.combine_pairs, dim=(max(rows.values()), pairs), inputs=[self.topology, p], device=self.device)
 
     def _set_constant(self, bundle: Any, name: str, value: np.ndarray) -> None:
         present = getattr(bundle, name)
