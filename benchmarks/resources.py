@@ -63,7 +63,7 @@ def kernels(precision: str) -> dict[str, wp.Kernel]:
     generators = ("lemke", "murty", "judice_pires")
     found |= {f"assembled_lcp[{method}, anitescu_potra]": lcp.make(real, method, True) for method in generators}
     for model in scenes():
-        bounces = "restitution" if model.restitution.any() else ""
+        bounces = "restitution" if model.bounces else ""
         options = [{"method": m} for m in METHODS if precision == "float64" or m != "velocity_pivoting"]
         laws = [{"formulation": law} for law in ("coulomb", "hybrid")]
         for option in (*options, {"method": "pgs", "integrator": "midpoint"}, *laws):

@@ -136,6 +136,7 @@ def make(real):
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f, a, p = pair_functions(real), axes(real), polygon(real)
     shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
+    sum_norm, far_apart, set_apart = f.sum_norm, f.far_apart, f.set_apart
     face_separation, edge_axis, edge_separation, column, rank = a.face_separation, a.edge_axis, a.edge_separation, a.column, a.rank
     Polygon, clip = p.Polygon, p.clip
 
@@ -340,10 +341,13 @@ def make(real):
             pair = first + index
             sa = topology.pairs[pair, 0]
             sb = topology.pairs[pair, 1]
-            xa = shape_pose(topology, bodies, env, sa)
-            xb = shape_pose(topology, bodies, env, sb)
             ha = topology.shape_size[sa]
             hb = topology.shape_size[sb]
+            if far_apart(topology, bodies, env, sa, sb, sum_norm(ha), sum_norm(hb), h):
+                set_apart(topology, slots, env, pair)
+                continue
+            xa = shape_pose(topology, bodies, env, sa)
+            xb = shape_pose(topology, bodies, env, sb)
             ca = wp.transform_get_translation(xa)
             cb = wp.transform_get_translation(xb)
             slot = topology.pair_slots[pair]

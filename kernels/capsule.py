@@ -169,7 +169,8 @@ def make(real) -> dict:
     vec3, transform = t.vec3, t.transform
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f, g = pair_functions(real), segment_functions(real)
-    shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
+    shape_pose, reach, set_apart, shape_velocity = f.shape_pose, f.reach, f.set_apart, f.shape_velocity
+    write, write_bent = f.write, f.write_bent
     outside_box, bend, whole, cut, direction, perpendicular = f.outside_box, f.bend, g.whole, g.cut, g.direction, g.perpendicular
     outside_segment, nearest_to_box, nearest_to_segment = g.outside_segment, g.nearest_to_box, g.nearest_to_segment
     covered_part = wp.constant(covered_within(real))
@@ -383,12 +384,12 @@ def make(real) -> dict:
             r = topology.shape_size[sb][0]
             half = topology.shape_size[sb][1]
             slot = topology.pair_slots[pair]
-            for k in range(3):
-                slots.gap[env, slot + k] = real(NO_POINT)
             centre = wp.transform_get_translation(box)
             middle = wp.transform_get_translation(capsule)
             near = reach(topology, bodies, env, sa, centre, wp.length(size), h) + reach(topology, bodies, env, sb, middle, half + r, h)
             if wp.length(middle - centre) < wp.length(size) + half + r + near:
+                for k in range(3):
+                    slots.gap[env, slot + k] = real(NO_POINT)
                 turn = wp.transform_get_rotation(box)
                 axis = z_axis(capsule)
                 c = wp.transform_point(wp.transform_inverse(box), middle)
@@ -404,6 +405,8 @@ def make(real) -> dict:
                     beside_box(slots, env, slot, box, size, c, e, half, r, motion)
                 else:
                     inside_box(slots, env, slot, box, size, c, e, half, r, near)
+            else:
+                set_apart(topology, slots, env, pair)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def capsule_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
@@ -419,13 +422,13 @@ def make(real) -> dict:
             rb = topology.shape_size[sb][0]
             lb = topology.shape_size[sb][1]
             slot = topology.pair_slots[pair]
-            for k in range(3):
-                slots.gap[env, slot + k] = real(NO_POINT)
             origin = wp.transform_get_translation(a)
             middle = wp.transform_get_translation(b)
             d = middle - origin
             near = reach(topology, bodies, env, sa, origin, la + ra, h) + reach(topology, bodies, env, sb, middle, lb + rb, h)
             if wp.length(d) < la + ra + lb + rb + near:
+                for k in range(3):
+                    slots.gap[env, slot + k] = real(NO_POINT)
                 ea = z_axis(a)
                 eb = z_axis(b)
                 motion = relative_motion(topology, bodies, env, sa, sb, middle, h)
@@ -467,6 +470,8 @@ def make(real) -> dict:
                         apart = outside_segment(p, ea, la)
                         n = direction(apart, wp.length(apart), least, across)
                         write_near(slots, env, slot + j, motion, origin + p, n, wp.length(apart), ra + rb, rb, end)
+            else:
+                set_apart(topology, slots, env, pair)
 
     return {
         ("PLANE", "CAPSULE"): plane_capsule,

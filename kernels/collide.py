@@ -3,7 +3,7 @@
 
 Every pair owns a fixed range of contact slots. A slot gets a point half-way across the gap, the unit normal from
 shape a to shape b, the gap (negative = penetration) and a feature number that stays the same while the same corner,
-edge or face touches. A slot without a point gets the gap NO_POINT.
+edge or face touches. A slot without a point gets the gap NO_POINT; of a pair that is far apart the first slot gets FAR_PAIR.
 """
 
 import functools
@@ -14,6 +14,8 @@ import warp as wp
 from .types import OPTIONS, scalar_types
 
 NO_POINT = wp.constant(1.0e30)
+# Gap of the first slot of a pair of which no slot has a point or a history: nothing else of it needs to be read.
+FAR_PAIR = wp.constant(2.0e30)
 # Cosine: directions from faces of a box that are square to each other, rotated to world axes, agree by less than this.
 SQUARE = wp.constant(1.0e-6)
 
@@ -44,6 +46,41 @@ def pair_functions(real) -> SimpleNamespace:
             lever = radius + wp.length(centre - bodies.com[env, body])
             travel += real(2.0) * h * (wp.length(wp.spatial_top(twist)) + wp.length(wp.spatial_bottom(twist)) * lever)
         return travel
+
+    @wp.func
+    def sum_norm(x: vec3) -> real:
+        return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
+
+    @wp.func
+    def widest_reach(topology: Topology, bodies: Bodies, env: int, shape: int, radius: real, h: real):
+        """Centre of a shape, and at least radius + ``reach``, without a root."""
+        centre = wp.transform_get_translation(topology.shape_pose[shape])
+        far = real(1.02) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
+        body = topology.shape_body[shape]
+        if body >= 0:
+            centre = wp.transform_point(bodies.pose[env, body], centre)
+            twist = bodies.free_velocity[env, body]
+            lever = radius + sum_norm(centre - bodies.com[env, body])
+            far += real(2.0) * h * (sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
+        return centre, far
+
+    @wp.func
+    def far_apart(topology: Topology, bodies: Bodies, env: int, a: int, b: int, ra: real, rb: real, h: real) -> bool:
+        """Are two shapes further apart than ``reach`` allows for, by a test without roots? Not all that are are found."""
+        ca, far_a = widest_reach(topology, bodies, env, a, ra, h)
+        cb, far_b = widest_reach(topology, bodies, env, b, rb, h)
+        far = far_a + far_b
+        return wp.length_sq(cb - ca) >= far * far
+
+    @wp.func
+    def set_apart(topology: Topology, slots: Slots, env: int, pair: int):
+        """A pair that is far apart has neither points nor history; it is written when it gets there, not as long as it stays."""
+        first = topology.pair_slots[pair]
+        if slots.gap[env, first] != real(FAR_PAIR):
+            for slot in range(first, topology.pair_slots[pair + 1]):
+                slots.gap[env, slot] = real(NO_POINT)
+                slots.last_feature[env, slot] = -1
+            slots.gap[env, first] = real(FAR_PAIR)
 
     @wp.func
     def shape_velocity(
@@ -94,6 +131,9 @@ def pair_functions(real) -> SimpleNamespace:
     return SimpleNamespace(
         shape_pose=shape_pose,
         reach=reach,
+        sum_norm=sum_norm,
+        far_apart=far_apart,
+        set_apart=set_apart,
         shape_velocity=shape_velocity,
         outside_box=outside_box,
         bend=bend,

@@ -2,12 +2,14 @@
 """Batches: environments are independent to the last bit, failures stay where they are, parameters differ per environment."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
 import warp as wp
 from conftest import DEVICE, block_on_plane, paper_box, random_quaternions, simulator
 from conftest import GRAVITY as G
+from warp_lcp.kernels.collide import FAR_PAIR
 
 import warp_lcp as wl
 from warp_lcp import methods
@@ -95,12 +97,20 @@ def test_recorded_steps_equal_eager_steps():
 
 def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
     """What a GPU does differently, done on the CPU: environments fastest in memory, a thread for each, several workspaces."""
-    cases = [{"method": "auto"}, {"method": "lemke"}, {"integrator": "midpoint"}]
+
+    def pass_each_other():
+        """Boxes, in reach of one another or not."""
+        sim = simulator(boxes_far_apart(5), 40, 2e-3)
+        sim.v.assign(np.random.default_rng(4).normal(size=sim.v.shape))
+        return sim
+
+    cases = [partial(randomised, 40, **options) for options in ({}, {"method": "lemke"}, {"integrator": "midpoint"})] + [pass_each_other]
     expected = []
-    for options in cases:
-        sim = randomised(40, **options)
+    for case in cases:
+        sim = case()
         sim.step(200)
         expected.append(bits(sim))
+    assert 0 < (sim.slots.gap.numpy() == FAR_PAIR).sum(axis=1).min() < (sim.slots.gap.numpy() == FAR_PAIR).sum(axis=1).max()
 
     def array(self, n, dtype):
         return wp.zeros((n, self.num_envs), dtype=dtype, device=self.device).transpose()
@@ -111,8 +121,8 @@ def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
     monkeypatch.setattr(wl.Simulator, "_array", array)
     monkeypatch.setattr(wl.Simulator, "launch", launch)
     monkeypatch.setattr("warp_lcp.methods.workspaces", lambda envs, scalars, device: 7)
-    for options, same in zip(cases, expected, strict=True):
-        sim = randomised(40, **options)
+    for case, same in zip(cases, expected, strict=True):
+        sim = case()
         assert sim.q.strides[0] < sim.q.strides[1]
         sim.step(200)
         assert (bits(sim) == same).all()
@@ -245,6 +255,26 @@ def test_changing_the_mass_updates_what_follows_from_it():
     impulse = sim.contacts.impulse.numpy()[:, :4, 0].sum(axis=1)
     assert impulse == pytest.approx([G * 1e-3, 10 * G * 1e-3], rel=1e-6)
     assert 0.1 - sim.q.numpy()[:, 2] == pytest.approx(np.full(2, G / 4e10), rel=1e-3)
+
+
+def test_what_a_pair_has_is_stored_once_unless_it_differs():
+    """Coefficients for each environment where friction differs, contact parameters where masses or stiffnesses do."""
+    sim = simulator(block_on_plane(0.5), 4)
+    m = sim.model
+    mu, mass = np.linspace(0.1, 0.4, 4), m.mass[0] * np.linspace(1.0, 4.0, 4)
+    randomised_mass, randomised_friction = {"mass": mass[:, None]}, {"friction": np.tile(mu[:, None, None], (1, 2, 2))}
+    for values, expected_mu, expected_mass in [
+        (randomised_mass, [0.5], mass),
+        (randomised_friction, mu, mass),
+        ({"mass": m.mass}, mu, m.mass),
+        ({"contact": np.tile(m.contact, (4, 1, 1))}, mu, np.tile(m.mass, 4)),
+        ({"friction": m.friction, "contact": m.contact}, [0.5], m.mass),
+    ]:
+        sim.set_parameters(**values)
+        friction, contact = sim.parameters.pair_friction.numpy(), sim.parameters.pair_contact.numpy()
+        assert friction == pytest.approx(np.tile(np.reshape(expected_mu, (-1, 1, 1)), (1, 1, 2)))
+        assert contact[:, 0, 0] == pytest.approx(1e10 * expected_mass)
+        sim.step()
 
 
 def test_parameters_reject_what_no_body_can_have():

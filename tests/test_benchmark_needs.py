@@ -48,7 +48,7 @@ def test_shipped_scenes_compile_kernels_of_what_is_in_them(name):
     scene = wl.load_usd(name)
     stages = {"kinematics", "free_motion", "combine_pairs", "select_contacts", "certify", "integrate", "reset", "proximal_contacts", "pgs"}
     pairs = {"_".join(wl.ShapeType(scene.shape_type[s]).name.lower() for s in pair) for pair in scene.pairs}
-    bounces = {"bounce", "judge", "settle"} if scene.restitution.any() else set()
+    bounces = {"bounce", "judge", "settle"} if scene.bounces else set()
     single = scene.dofs == 6
     rows = {"contact_rows"} if bounces or not single else set()
     assert set(ledger(scene)["kernels"]) == stages | pairs | bounces | rows | {"solve_single" if single else "pivot"}
@@ -57,6 +57,7 @@ def test_shipped_scenes_compile_kernels_of_what_is_in_them(name):
 def test_features_compile_only_their_own_kernels():
     alone, stack = kernels("box"), kernels("stack")
     assert kernels("box", "3 shapes filtered out") == alone
+    assert kernels("box", "3 shapes filtered out, e = 0.5") == alone
     assert kernels("box", "100 static boxes") == alone | {"box_box"}
     assert kernels("box", "10 static capsules") == alone | {"box_capsule"}
     assert kernels("box", "fixed body, 2 shapes") == alone | {"box_box", "sphere_box"}
@@ -149,8 +150,8 @@ def test_comparison_says_what_changed(monkeypatch, name):
         "its mass randomised": {"bytes"},
     }[name]
     assert set(needs.changed(row)) - {"time"} == expected
-    # Of its own: mass and inertia of two bodies, coefficients and parameters of three pairs.
-    own = 2 * (8 + 72) + 3 * (2 + 5) * 8 if feature.change else 0
+    # Of its own: mass and inertia of two bodies, contact parameters of three pairs.
+    own = 2 * (8 + 72) + 3 * 5 * 8 if feature.change else 0
     assert row["bytes"] == facts["bytes_per_env"] + own
     assert row["bytes_expected"] == row["bytes_base"] + (ledger(model(None, feature))["bytes_per_env"] if feature.moves else 0)
     assert row["kernels_less"] == (["solve_single"] if feature.moves else [])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from conftest import random_quaternions, simulator
 from scipy.optimize import lsq_linear
+from warp_lcp.kernels.collide import FAR_PAIR, NO_POINT
 
 import warp_lcp as wl
 from warp_lcp.builder import rotation_matrix
@@ -131,6 +132,69 @@ def test_features_follow_the_corners_while_a_box_slides():
         sim.step(10)
         assert sim.contacts.count.numpy()[0] == 4
         assert set(sim.slots.last_feature.numpy()[0]) - {-1} == first
+
+
+def test_pairs_count_as_far_only_where_no_point_could_get_a_row():
+    """Beyond what centres, radii and velocities allow within two steps, for shapes off the centre of their bodies as well.
+
+    And all do from three times that on: the test is of sums of absolute values, of turns and of arms.
+    """
+    rng, envs, h = np.random.default_rng(9), 1000, 0.05
+    off = np.array([[0.8, 0.0, 0.0], [0.0, -0.6, 0.0]])
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    for size, x in zip((SIZE_A, SIZE_B), off, strict=True):
+        builder.add_box(builder.add_body(mass=1.0, com=(0, 0, 0), inertia=np.eye(3)), size, pose=(*x, 0, 0, 0, 1))
+    q, v = random_poses(rng, envs, 6.0), rng.normal(size=(envs, 2, 6)) * rng.uniform(0, 10, (envs, 1, 1))
+    q[::2, :, 3:], v[::2, :, :5] = (0, 0, 0, 1), 0.0  # of these the sums are the lengths
+    (gap,) = slots(builder, q, v, h, "gap")
+    centre = np.array([[pose[:3] + rotation_matrix(pose[3:]) @ x for pose, x in zip(env, off, strict=True)] for env in q])
+    radius = np.array([np.linalg.norm(SIZE_A), np.linalg.norm(SIZE_B)])
+    lever = radius + np.linalg.norm(off, axis=1)
+    travel = 2 * h * (np.linalg.norm(v[..., :3], axis=2) + np.linalg.norm(v[..., 3:], axis=2) * lever)
+    reach = (1.01 * radius + travel).sum(axis=1)
+    distance = np.linalg.norm(centre[:, 1] - centre[:, 0], axis=1)
+    far = gap[:, 0] == FAR_PAIR
+    assert (gap[:, 1:][far] == NO_POINT).all()
+    assert (distance[far] >= reach[far] * (1 - 1e-12)).all()
+    assert far[distance > 3.0 * reach].all()
+    assert (far.sum(), (distance > reach).sum(), (gap[:, 0] < NO_POINT).sum()) > (100, 200, 100)
+
+
+@pytest.mark.parametrize("shape", ["box on box", "capsule on box", "capsule on capsule"])
+def test_a_body_that_comes_back_starts_with_fresh_contacts(shape):
+    """Far away for a step it has left its contacts behind: back at the same place its bristles are not remembered."""
+    builder = wl.ModelBuilder()
+    lie = (np.sqrt(0.5), 0, 0, np.sqrt(0.5))  # along y
+    if shape == "capsule on capsule":
+        builder.add_capsule(-1, 0.1, 0.5, pose=(0, 0, -0.1, *lie))
+    else:
+        builder.add_box(-1, (1, 1, 0.1), pose=(0, 0, -0.1, 0, 0, 0, 1))
+    body = builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1), velocity=(0.1, 0.2, 0))
+    if shape == "box on box":
+        builder.add_box(body, (0.1, 0.1, 0.1))
+    else:
+        builder.add_capsule(body, 0.1, 0.3, pose=(0, 0, 0, *lie))
+    model = builder.finalize()
+    stayed, away, fresh = (simulator(model) for _ in range(3))
+    for sim in (stayed, away):
+        sim.step(20)
+    q, v = stayed.q.numpy(), stayed.v.numpy()
+    assert (away.slots.last_feature.numpy() >= 0).any()
+    away.q.assign(q + np.array([100.0, 0, 0, 0, 0, 0, 0]))
+    for _ in range(2):  # the second step finds it there
+        away.step()
+        assert away.slots.gap.numpy()[0, 0] == FAR_PAIR
+        assert (away.slots.last_feature.numpy() == -1).all()
+        assert away.contacts.count.numpy()[0] == 0
+    for sim in (away, fresh):
+        sim.q.assign(q)
+        sim.v.assign(v)
+    for sim in (stayed, away, fresh):
+        sim.step(5)
+    assert (away.q.numpy() == fresh.q.numpy()).all()
+    assert (away.v.numpy() == fresh.v.numpy()).all()
+    assert (away.contacts.impulse.numpy() == fresh.contacts.impulse.numpy()).all()
+    assert (away.v.numpy() != stayed.v.numpy()).any()
 
 
 def separation(q: np.ndarray, size_a, size_b, shifts: np.ndarray) -> np.ndarray:

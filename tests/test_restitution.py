@@ -14,7 +14,7 @@ from conftest import GRAVITY as G
 from conftest import paper_box, random_quaternions, simulator
 
 import warp_lcp as wl
-from warp_lcp.cli import Tally
+from warp_lcp.cli import Tally, ledger
 from warp_lcp.laws import FORMULATIONS
 from warp_lcp.simulator import kernel_names
 
@@ -330,6 +330,23 @@ def test_without_restitution_nothing_is_compiled_or_kept():
     assert not KERNELS & set(kernel_names(paper_box()))
     assert simulator(paper_box()).bounces is None
     assert set(kernel_names(ball(0.5).finalize())) >= KERNELS
+
+
+def test_a_material_that_no_pair_has_brings_nothing():
+    """A bouncy shape that nothing may touch: no kernels, no arrays, until a pair bounces."""
+    plain, builder = ball(0.0).finalize(), ball(0.0)
+    builder.filter_pair(1, builder.add_sphere(-1, 0.1, pose=(3, 0, 0, 0, 0, 0, 1), material=wl.Material(restitution=1.0)))
+    model = builder.finalize()
+    assert model.restitution.any()
+    assert not model.bounces
+    assert kernel_names(model) == kernel_names(plain)
+    assert ledger(model)["bytes_per_env"] == ledger(plain)["bytes_per_env"]
+    sim = simulator(model)
+    assert sim.bounces is None
+    sim.set_parameters(restitution=[0.0, 0.0, 0.5])
+    assert sim.bounces is None
+    sim.set_parameters(restitution=[0.5, 0.0, 0.0])
+    assert sim.bounces is not None
 
 
 def test_zero_is_the_same_to_the_last_bit():

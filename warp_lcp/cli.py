@@ -198,7 +198,7 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
 
     types, law = scalar_types(wp.float64), law or Law()
     widths = {types.Bodies: model.num_bodies, types.Slots: model.num_slots, types.Contacts: model.max_contacts}
-    if model.restitution.any():
+    if model.bounces:
         widths[restitution.make(wp.float64).Bounces] = model.max_contacts
     total = 2 * 8 * (model.nq + model.nv)  # q, q0, v, v0
     total += 2 * model.num_bodies * wp.types.type_size_in_bytes(types.spatial)  # wrench, next velocity

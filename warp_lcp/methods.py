@@ -182,7 +182,7 @@ class VelocityPivoting(Method):
         else:
             self.parts = pivoting.make(*self.kind)
             self.kernel = self.parts.pivot
-        if model.restitution.any():
+        if model.bounces:
             self.take_rows()
 
     def take_rows(self) -> None:

@@ -210,6 +210,11 @@ class Model:
         return int(self.pair_slots[-1])
 
     @property
+    def bounces(self) -> bool:
+        """Does a pair of materials give back anything of an impact?"""
+        return bool(self.restitution[self.pairs].any())
+
+    @property
     def max_contacts(self) -> int:
         """Contacts that may act at one time in one environment.
 

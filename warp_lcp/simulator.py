@@ -229,7 +229,7 @@ class Simulator:
 
         What follows from a parameter follows at once: inverse masses, the scaling of Table 1, the coefficients of a
         pair. ``mass`` without ``inertia`` is a body of the same shape and another density: its inertia scales along.
-        Where the model has no restitution, the first one above zero loads the kernels that it needs.
+        Where no pair of the model bounces, the first that does loads the kernels that it needs.
 
         Raises:
             WarpLcpError: for an unknown name, a wrong shape, or a number that no body or contact can have.
@@ -247,12 +247,13 @@ class Simulator:
     def _combine_pairs(self) -> None:
         """Friction and contact parameters of the pairs, from those of their shapes and bodies."""
         p, t, pairs = self.parameters, self._types, len(self.model.pairs)
-        rows = max(p.mass.shape[0], p.friction.shape[0], p.contact.shape[0])
-        if p.pair_contact is None or p.pair_contact.shape != (rows, pairs):
-            p.pair_friction = wp.empty((rows, pairs), dtype=t.vec2, device=self.device)
-            p.pair_contact = wp.empty((rows, pairs), dtype=t.vec5, device=self.device)
-            self._graphs.clear()
-        wp.launch(self._kernels.combine_pairs, dim=(rows, pairs), inputs=[self.topology, p], device=self.device)
+        rows = {"pair_friction": p.friction.shape[0], "pair_contact": max(p.mass.shape[0], p.contact.shape[0])}
+        for name, dtype in (("pair_friction", t.vec2), ("pair_contact", t.vec5)):
+            present = getattr(p, name)
+            if present is None or present.shape != (rows[name], pairs):
+                setattr(p, name, wp.empty((rows[name], pairs), dtype=dtype, device=self.device))
+                self._graphs.clear()
+        wp.launch(self._kernels.combine_pairs, dim=(max(rows.values()), pairs), inputs=[self.topology, p], device=self.device)
 
     def _set_constant(self, bundle: Any, name: str, value: np.ndarray) -> None:
         present = getattr(bundle, name)
@@ -263,10 +264,10 @@ class Simulator:
             self._graphs.clear()  # they hold the address of the old array
 
     def _set_restitution(self, value: np.ndarray) -> None:
-        """[1|E, S] e of the shapes. While all are zero, and always were, nothing of restitution exists."""
+        """[1|E, S] e of the shapes. While no pair has any, and never had, nothing of restitution exists."""
         if self.bounces is not None:
             self._set_constant(self.bounces, "coefficient", value)
-        elif value.any():
+        elif value[:, self.model.pairs].any():
             k = restitution.make(self.real)
             self._kernels.bounce, self._kernels.judge, self._kernels.settle = k.bounce, k.judge, k.settle
             bounces = self.bounces = k.Bounces()
@@ -552,7 +553,7 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     )
     if not without_rows:
         stages.contact_rows = rows.contact_rows
-    if model.restitution.any():
+    if model.bounces:
         rebound = restitution.make(real)
         stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
     if integrator == "midpoint":
