@@ -38,7 +38,7 @@ QUICK_STEPS = (1e-2, 2e-3)
 ENVS = {"stack10": 8, "rolling": 8, "heap": 8}
 USUAL_ENVS = 64
 TIMED = 0.2  # s of simulated time that are timed
-REPETITIONS = 3
+TURNS, LEAST_TURN = 3, 0.05  # s: a turn repeats a short run for so long and keeps its median
 PATIENCE = 30.0  # s that a run from beginning to end may be expected to take
 TURN = 2.0  # s that a timed turn is expected to take at most, if that leaves ten steps
 
@@ -118,6 +118,14 @@ def spread(seconds: list[float], scene: Scene) -> dict[str, float]:
 Clock = Callable[[], float]
 
 
+def turn(clock: Clock) -> float:
+    """One turn of a run: its median time [s]. A machine that is shared stops for longer than a short run takes."""
+    seconds = [clock()]
+    while sum(seconds) < LEAST_TURN:
+        seconds.append(clock())
+    return statistics.median(seconds)
+
+
 def ours_at(case: Case, h: float, device: Any) -> tuple[list[dict[str, Any]], list[Clock]]:
     """Our points at a step, and what times each of them once."""
     points, clocks = [], []
@@ -189,20 +197,18 @@ def at(case: Case, h: float, sessions: list[Session], known: dict[tuple[str, str
     """All points of a case at a step, timed in turns."""
     mine, clocks = ours_at(case, h, device)
     theirs, tasks = theirs_at(case, h, sessions, known)
-    seconds: list[list[float]] = [[] for _ in clocks]
-    for _ in range(REPETITIONS):
-        for clock, into in zip(clocks, seconds, strict=True):
-            into.append(clock())
-        for task in tasks:
-            if task is not None:
-                task[0].repeat()
-    scene = part(case, h)
-    for row, measured in zip(mine, seconds, strict=True):
-        row |= spread(measured, scene)
+    running = [*clocks, *(pair[0].repeat for pair in tasks if pair is not None)]
+    seconds: list[list[float]] = [[] for _ in running]
+    for _ in range(TURNS):
+        for clock, into in zip(running, seconds, strict=True):
+            into.append(turn(clock))
+    scene, measured = part(case, h), iter(seconds)
+    for row in mine:
+        row |= spread(next(measured), scene)
     for row, pair in zip(theirs, tasks, strict=True):
         if pair is not None:
             task, short = pair
-            row |= spread(task.seconds, short)
+            row |= spread(next(measured), short)
             row["problems"] += [problem for problem in compare.problems(short, task) if problem not in row["problems"]]
             task.drop()
     return mine + theirs
