@@ -3,18 +3,17 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warp_lcp.errors import MissingExtra
-
 from .cases import CASES
 from .chart import beaten, counts, front
+from .pictures import pyplot, save
 
-SVG = "http://www.w3.org/2000/svg"
+STYLE = {"font_size": 11, "axes_linewidth": 0.7, "svg_fonttype": "none"}
+
 #: Errors and energies under these are drawn there: round-off is no accuracy.
 LEAST_ERROR, LEAST_ENERGY = 1e-12, 1e-18
 #: Colour, line, marker, size and label of our curves and of other engines; each differs in more than colour.
@@ -50,23 +49,6 @@ SHOWN = {
 }
 
 
-def pyplot() -> Any:
-    """matplotlib without a screen.
-
-    Raises:
-        MissingExtra: without matplotlib.
-    """
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise MissingExtra("the picture", "bench", error) from error
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams |= {"font.size": 11, "svg.hashsalt": "chart", "axes.linewidth": 0.7, "svg.fonttype": "none"}
-    return plt
-
-
 def title(row: dict[str, Any]) -> str:
     """What a point says when a pointer is over it."""
     own = f", residual {row['residual']:.0e} m/s" if row.get("residual") is not None else ""
@@ -75,23 +57,6 @@ def title(row: dict[str, Any]) -> str:
         f"{row['engine']}, {row['setting']}, {row['knob']}: {row['error']:.2e} {row['unit']}, "
         f"{row['per_ms_us']:.3g} us/ms, {1e6 * row['step_s']:.3g} us a step (spread {100 * row['spread']:.0f} %){energy}{own}"
     )
-
-
-def save(figure: Any, path: Path, titles: dict[str, str]) -> list[Path]:
-    """path.png and path.svg, the latter with a title for every element whose id is a key of `titles`."""
-    files = [path.with_suffix(".png"), path.with_suffix(".svg")]
-    figure.savefig(files[0], dpi=130)
-    figure.savefig(files[1], metadata={"Date": None})  # the same data give the same file
-    ElementTree.register_namespace("", SVG)
-    ElementTree.register_namespace("xlink", "http://www.w3.org/1999/xlink")
-    tree = ElementTree.parse(files[1])
-    for element in tree.iter():
-        if element.get("id") in titles:
-            said = ElementTree.Element(f"{{{SVG}}}title")
-            said.text = titles[element.get("id", "")]
-            element.insert(0, said)
-    tree.write(files[1], encoding="unicode", xml_declaration=True)
-    return files
 
 
 def curves(rows: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
@@ -132,7 +97,7 @@ def panel(axis: Any, rows: list[dict[str, Any]], key: str, least: float, titles:
 
 def draw(rows: list[dict[str, Any]], path: Path, key: str = "error") -> list[Path]:
     """The chart: a panel for each case and a summary; key 'error' or 'E_uc'."""
-    plt = pyplot()
+    plt = pyplot(**STYLE)
     good = [row for row in rows if counts(row)]
     cases = list(dict.fromkeys(row["case"] for row in rows))
     columns = 3
@@ -162,7 +127,7 @@ def draw(rows: list[dict[str, Any]], path: Path, key: str = "error") -> list[Pat
     height, room = figure.get_size_inches()[1], 0.25 * -(-len(handles) // 4) + 0.2  # inches of the legend
     figure.legend(handles=handles, loc="lower center", ncols=4, frameon=False, fontsize=11)
     figure.tight_layout(rect=(0, room / height, 1, 1), h_pad=1.5)
-    files = save(figure, path, titles)
+    files = save(figure, path, 130, titles)
     plt.close(figure)
     return files
 
@@ -195,7 +160,7 @@ def summary(axis: Any, good: list[dict[str, Any]], cases: list[str], key: str) -
 
 def draw_box(rows: list[dict[str, Any]], path: Path) -> list[Path]:
     """The paper's box at a step of 1 ms: its height over time, and its way seen from above, of every engine."""
-    plt = pyplot()
+    plt = pyplot(**STYLE)
     known = {(row["engine"], row["setting"]): row | row["path"] for row in rows if row.get("path")}
     paths = [known[key] for key in ((engine, setting) for engine, settings in SHOWN.items() for setting in settings) if key in known]
     figure, (side, above) = plt.subplots(1, 2, figsize=(11.0, 5.4), width_ratios=(1.6, 1.0))
@@ -220,6 +185,6 @@ def draw_box(rows: list[dict[str, Any]], path: Path) -> list[Path]:
     above.set_title("from above; star: continuous motion", fontsize=10)
     side.set_title("the paper's box, h = 1 ms; in the legend the largest height", fontsize=10)
     figure.tight_layout(rect=(0, 0.16, 1, 1))
-    files = save(figure, path, titles)
+    files = save(figure, path, 130, titles)
     plt.close(figure)
     return files

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from warp_lcp.errors import MissingExtra
+from .pictures import pyplot, save
 
 #: Grey, dashes, marker of the end: told apart without colour. Laws that lie on each other differ in marker size as well.
 STYLES: dict[str, tuple[str, Any, str, float]] = {
@@ -48,14 +48,7 @@ def draw(data: dict[str, Any], path: Path) -> None:
     Raises:
         MissingExtra: without matplotlib.
     """
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise MissingExtra("the picture", "bench", error) from error
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams |= {"font.size": 9, "svg.hashsalt": "paper", "axes.linewidth": 0.6}
+    plt = pyplot(font_size=9, axes_linewidth=0.6)
     figure, axes = plt.subplots(3, 2, figsize=(8.2, 12.2))
     reference = np.array(data["reference"])
     end = reference[-1, :2]
@@ -100,7 +93,5 @@ def draw(data: dict[str, Any], path: Path) -> None:
         handles.append(plt.Line2D([], [], color=grey, linestyle=dashes, linewidth=1.1, **options))
     figure.legend(handles=handles, loc="lower center", ncols=3, frameon=False, handlelength=4.5, fontsize=8)
     figure.tight_layout(rect=(0, 0.07, 1, 1))
-    for ending in (".png", ".svg"):
-        metadata = {"Date": None} if ending == ".svg" else {}  # the same data give the same file
-        figure.savefig(path.with_suffix(ending), dpi=150, metadata=metadata)
+    save(figure, path)
     plt.close(figure)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .chart_picture import pyplot, save
+from .pictures import pyplot, save
 
 
 def survived_to(rows: list[dict[str, Any]]) -> dict[tuple[str, str], float | None]:
@@ -29,7 +29,7 @@ def survived_to(rows: list[dict[str, Any]]) -> dict[tuple[str, str], float | Non
 
 def draw(rows: list[dict[str, Any]], path: Path) -> list[Path]:
     """A line for each variant, a column for each case; darker is worse, numbers are steps in ms."""
-    plt = pyplot()
+    plt = pyplot(svg_fonttype="none")
     variants, cases = (list(dict.fromkeys(row[name] for row in rows)) for name in ("variant", "case"))
     steps = [0.0, *sorted({row["h"] for row in rows})]
     limits = survived_to(rows)
@@ -40,8 +40,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> list[Path]:
             if limit is not None:
                 shade[i, j] = steps.index(limit) / (len(steps) - 1)
     figure, axis = plt.subplots(figsize=(0.36 * len(cases) + 3.2, 0.29 * len(variants) + 2.6))
-    colours = plt.get_cmap("Greys_r").copy()
-    colours.set_bad("#f2d8b8")
+    colours = plt.get_cmap("Greys_r").with_extremes(bad="#f2d8b8")
     axis.imshow(np.ma.masked_invalid(shade), cmap=colours, vmin=-0.25, vmax=1.0, aspect="auto")
     for i in range(len(variants)):
         for j in range(len(cases)):
@@ -53,6 +52,6 @@ def draw(rows: list[dict[str, Any]], path: Path) -> list[Path]:
     axis.tick_params(length=0)
     axis.set_title("largest step [ms] up to which it survives (0: none of them; –: refused)", fontsize=11)
     figure.tight_layout()
-    files = save(figure, path, {})
+    files = save(figure, path, 130)
     plt.close(figure)
     return files

@@ -11,7 +11,7 @@ import pytest
 from test_benchmarks import FAKE
 
 from benchmarks import __main__ as command
-from benchmarks import accuracy, chart, chart_picture, peers, regression, report, stability_picture
+from benchmarks import accuracy, chart, chart_picture, peers, pictures, regression, report, stability_picture
 from benchmarks.cases import CASES
 
 ROOT = Path(__file__).parents[1]
@@ -102,7 +102,7 @@ def test_picture(tmp_path):
         png, svg = chart_picture.draw(rows, tmp_path / key, key)
         first = svg.read_bytes()
         assert chart_picture.draw(rows, tmp_path / key, key)[1].read_bytes() == first
-        titles = [element.text for element in ElementTree.parse(svg).iter(f"{{{chart_picture.SVG}}}title")]
+        titles = [element.text for element in ElementTree.parse(svg).iter(f"{{{pictures.SVG}}}title")]
         assert len([text for text in titles if text.startswith("warp_lcp")]) == 2
         assert "mujoco, elliptic, 10 ms: 0.00e+00 m, 3 us/ms, 30 us a step (spread 10 %), E_uc 0.0e+00 J" in titles
         assert png.stat().st_size > 20_000

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..pictures import pyplot, save
 from . import summary
 
 #: Line style, marker, width, shade of each curve in order: of ours, and of a rival's.
@@ -51,12 +52,7 @@ def draw(rows: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
 
     The fastest solver is the fastest of all rows. Needs the extra 'bench'.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams["svg.hashsalt"] = "warp_lcp"
+    plt = pyplot()
     names = summary.rivals(rows)
     size = (len(names), len(summary.TOLERANCES))
     figure, axes = plt.subplots(*size, figsize=(10.0, 4.2 * len(names)), sharex=True, sharey=True, squeeze=False, layout="constrained")
@@ -73,8 +69,6 @@ def draw(rows: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
     for axis in axes[-1]:
         axis.set_xlabel("time / time of the fastest solver")
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"friction_profile.{kind}" for kind in ("png", "svg")]
-    figure.savefig(paths[0], dpi=150, metadata={"Software": None})
-    figure.savefig(paths[1], metadata={"Date": None})
+    paths = save(figure, folder / "friction_profile")
     plt.close(figure)
     return paths
