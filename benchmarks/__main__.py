@@ -51,7 +51,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     """What was asked for; `run` is the function that does it."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Measure warp_lcp; results go to a JSON file.")
     out = argparse.ArgumentParser(add_help=False)
-    out.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder of the JSON file")
+    out.add_argument("--out", type=Path, help="folder of the JSON file (default: benchmarks/results, or build/benchmarks of a part)")
     quick = argparse.ArgumentParser(add_help=False)
     quick.add_argument("--quick", action="store_true", help="less of everything, for a look; documents stay as they are")
     place = argparse.ArgumentParser(add_help=False)
@@ -62,7 +62,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     for parent, usual, said in ((which, list(CASES), "all"), (few, chart.CHARTED, ",".join(chart.CHARTED))):
         parent.add_argument("--cases", type=case_names, default=usual, metavar="all|NAME,...", help=f"with known outcome (default: {said})")
     docs = argparse.ArgumentParser(add_help=False)
-    docs.add_argument("--docs", type=Path, help="folder of documents and pictures (default: docs; with --quick: none)")
+    docs.add_argument("--docs", type=Path, help="folder of documents and pictures (default: docs, or none of a part)")
     commands = parser.add_subparsers(dest="what", required=True)
 
     def command(
@@ -123,45 +123,55 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     return found
 
 
-def keep(asked: argparse.Namespace, device: wp.Device, data: dict[str, Any]) -> Path:
+def keep(asked: argparse.Namespace, device: wp.Device, data: dict[str, Any], complete: bool = True) -> None:
     """Write the result, and say what got worse since the last one of its kind."""
-    path = report.write(asked.out, asked.what, device, data)
-    print(f"\nwritten to {path}")
-    before = regression.last(path, report.RESULTS) if asked.what in regression.KINDS else None
-    if before:
-        found = regression.worse(before, path)
-        print("\n".join([f"{len(found)} worse than in {before.name}", *found]))
-    return path
+    folder = target(asked, complete)
+    path = report.path_of(folder, asked.what, device)
+    before = path if path.exists() else regression.last(path, report.RESULTS)
+    old = regression.read(before) if before and asked.what in regression.KINDS else None  # it may be overwritten
+    print(f"\nwritten to {report.write(folder, asked.what, device, data)}")
+    if old and complete:
+        found = regression.worse(old, regression.read(path))
+        print("\n".join([f"{len(found)} worse than in {before}", *found]))
 
 
-def documents(asked: argparse.Namespace) -> Path | None:
+def target(asked: argparse.Namespace, complete: bool) -> Path:
+    """Folder of the JSON file: what leaves something out does not stand beside whole results."""
+    quick = getattr(asked, "quick", False)
+    return asked.out or (report.RESULTS if complete and not quick else report.PARTIAL)
+
+
+def documents(asked: argparse.Namespace, complete: bool) -> Path | None:
     """Folder of the documents that a run writes; None where it leaves them alone."""
-    return asked.docs or (None if asked.quick else report.DOCS)
+    return asked.docs or (report.DOCS if complete and not asked.quick else None)
 
 
 def run_accuracy(asked: argparse.Namespace) -> None:
-    device = wp.get_device(asked.device)
+    device, complete = wp.get_device(asked.device), asked.cases == list(CASES)
     rows = accuracy.measure(device, asked.cases, asked.quick)
     print(accuracy.markdown(rows))
-    keep(asked, device, {"rows": rows})
-    if (folder := documents(asked)) and asked.cases == list(CASES):
+    keep(asked, device, {"rows": rows}, complete)
+    if folder := documents(asked, complete):
         report.document("accuracy", accuracy.markdown(rows), folder / "accuracy.md")
 
 
 def run_stability(asked: argparse.Namespace) -> None:
     device = wp.get_device(asked.device)
     variants = asked.variants or stability.chosen("some" if asked.quick else "all")
+    envs = asked.envs or (64 if asked.quick else 4096)
+    complete = asked.cases == list(CASES) and len(variants) == len(stability.VARIANTS) and envs >= 4096
     rows = stability.measure(device, asked.cases, variants, asked.quick)
-    crowds = stability.crowd(device, asked.cases, asked.envs or (64 if asked.quick else 4096))
+    crowds = stability.crowd(device, asked.cases, envs)
     print(stability.markdown(rows, crowds))
-    keep(asked, device, {"rows": rows, "crowds": crowds})
-    if (folder := documents(asked)) and asked.cases == list(CASES):
+    keep(asked, device, {"rows": rows, "crowds": crowds}, complete)
+    if folder := documents(asked, complete):
         report.document("stability", stability.markdown(rows, crowds), folder / "stability.md")
         stability_picture.draw(rows, folder / "stability")
 
 
 def run_chart(asked: argparse.Namespace) -> None:
     """Measured, unless data are given, kept after every case, told and drawn."""
+    complete = False
     if asked.data:
         try:
             rows = json.loads(asked.data.read_text())["rows"]
@@ -169,21 +179,24 @@ def run_chart(asked: argparse.Namespace) -> None:
             raise SystemExit(f"python -m benchmarks: error: {asked.data} holds no data of a chart: {error}") from error
     else:
         device = wp.get_device(asked.device)
-        names = asked.peers if asked.peers is not None else [] if asked.quick else list(peers.PEERS)
+        names = asked.peers if asked.peers is not None else [] if asked.quick or device.is_cuda else list(peers.PEERS)
+        if names and device.is_cuda:
+            raise SystemExit("python -m benchmarks: error: other engines run on the CPU: --peers none, or --device cpu")
         present, absent = peers.split(names, asked.dir)
         if absent:
             print(absent)
+        complete = asked.cases == chart.CHARTED and len(present) == len(peers.PEERS)
         for rows in chart.measure(asked.cases, present, asked.dir, device, asked.quick):
-            report.write(asked.out, asked.what, device, {"rows": rows})
-        keep(asked, device, {"rows": rows})
+            report.write(asked.out or report.PARTIAL, asked.what, device, {"rows": rows})
+        keep(asked, device, {"rows": rows}, complete)
     print(chart.markdown(rows))
-    if folder := documents(asked):
+    if folder := documents(asked, complete):
         folder.mkdir(parents=True, exist_ok=True)
         drawn = chart_picture.draw(rows, folder / "chart") + chart_picture.draw(rows, folder / "chart_energy", "E_uc")
         if any(row.get("path") for row in rows):
             drawn += chart_picture.draw_box(rows, folder / "chart_box")
         print(f"\ndrawn: {', '.join(str(file) for file in drawn)}")
-        if {row["case"] for row in rows} == set(chart.CHARTED) and (folder / "chart.md").exists():
+        if (folder / "chart.md").exists():
             report.document("chart", chart.markdown(rows), folder / "chart.md")
 
 
@@ -207,7 +220,7 @@ def run_speed(asked: argparse.Namespace) -> None:
     stacks, failures, floors = goals.mass_ratio(asked.quick), goals.fallback(device, asked.quick), step_floor.measure(asked.quick)
     print(f"\n{goals.markdown(stacks, failures)}\n\n{step_floor.markdown(floors)}")
     data = {"start_up": start, "rows": rows, "mass_ratio": stacks, "fallback": failures, "step_floor": floors}
-    report.write(asked.out, asked.what, device, data)  # kept if a peer fails
+    report.write(target(asked, True), asked.what, device, data)  # kept if a peer fails
     keep(asked, device, data | compared(asked.peers, asked.quick, asked.dir))
 
 
@@ -252,7 +265,6 @@ def run_paper(asked: argparse.Namespace) -> None:
         else:
             asked.out.mkdir(parents=True, exist_ok=True)
         paper_picture.draw(data, (asked.out or report.DOCS) / "paper_comparison")
-    asked.out = asked.out or Path("benchmarks/results")
     keep(asked, device, data)
 
 
@@ -280,7 +292,7 @@ def run_regression(asked: argparse.Namespace) -> None:
         before = asked.old or regression.last(asked.new, report.RESULTS)
         if before is None:
             raise ValueError(f"no result of this kind is kept in {report.RESULTS}; name one")
-        found = regression.worse(before, asked.new)
+        found = regression.worse(regression.read(before), regression.read(asked.new))
     except ValueError as error:
         raise SystemExit(f"python -m benchmarks: error: {error}") from error
     print("\n".join([f"{len(found)} worse than in {before}", *found]))

@@ -4,7 +4,7 @@
 A point is an engine's setting at a step size. Its error is that of the case's first metric over a run from beginning to end. Its
 time is the wall time per environment and simulated time, in us per ms: at a step of 1 ms that is the time per step. (Time per
 step alone would make the smallest step the best deal of every engine.) Timed is a batch over the first part of the motion, all
-engines in turns; the energy by which its steps miss the laws (energy_error.py) stands beside.
+engines in turns; the energy by which steps of that part miss the laws (energy_error.py) stands beside.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from . import energy_error
+from . import energy_error, motion, stability
 from .cases import CASES, Case
 from .motion import Motion
 from .peers import Peer, compare
@@ -30,9 +31,6 @@ from .scenes import Scene
 
 CHARTED = [name for name, case in CASES.items() if case.charted]
 STEPS = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4)
-#: Smallest steps of other engines: most, those that take microseconds a step, those that take up to milliseconds.
-LEAST = {"mujoco": 2e-4, "newton_xpbd": 2e-4, "newton_padmm": 2e-3, "newton_lox": 2e-3}
-USUAL_LEAST = 1e-3
 QUICK_STEPS = (1e-2, 2e-3)
 #: Environments that are timed together, where a case is not slow.
 ENVS = {"stack10": 8, "rolling": 8, "heap": 8}
@@ -40,7 +38,10 @@ USUAL_ENVS = 64
 TIMED = 0.2  # s of simulated time that are timed
 TURNS, LEAST_TURN = 3, 0.05  # s: a turn repeats a short run for so long and keeps its median
 PATIENCE = 30.0  # s that a run from beginning to end may be expected to take
-TURN = 2.0  # s that a timed turn is expected to take at most, if that leaves ten steps
+TURN = 4.0  # s that a timed turn is expected to take at most: slow engines get fewer environments, but no fewer than LEAST_ENVS
+LEAST_ENVS = 4
+#: Errors under this are round-off, and no better than it.
+ROUND_OFF = 1e-12
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,6 @@ OURS = (
     Ours("AP, k = 2 to 16", {"formulation": "anitescu_potra"}, (2, 4, 8, 16)),
 )
 KNOB_STEP = 1e-3  # s, where the knob is another one
-SLOW = ("lemke",)  # not where there are many contacts
-MANY = ("stack10", "rolling", "heap")
 
 
 def envs(case: str) -> int:
@@ -86,9 +85,7 @@ def point(case: Case, moved: Motion, engine: str, setting: str, knob: str, h: fl
         "errors": errors,
         "finite": finite,
         "contacts": moved.contacts,
-        "E_uc": energy_error.largest(moved),
-        "E_uc_of_a_fall": energy_error.of_a_fall(moved.scene),
-        "energy_rise": case.energy_rise(moved) if finite else None,
+        "energy_rise": case.energy_rise(moved),
         "certified": moved.certified if len(moved.status) else None,
         "residual": float(moved.residual.max()) if moved.residual.size else None,
         "path": path(moved) if (case.name, h) == ("box", KNOB_STEP) else None,
@@ -101,18 +98,40 @@ def path(moved: Motion) -> dict[str, list[float]]:
     return {name: [round(float(x), 6) for x in values] for name, values in zip(("time", "x", "y", "z"), numbers, strict=True)}
 
 
+@cache
+def settled(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Pose and velocity that the timed part of a case starts from, for everyone: of our own motion at 1 ms."""
+    case = CASES[name]
+    if not case.timed_from:
+        scene = case.scene(1e-3)
+        return scene.pose, scene.velocity
+    scene = replace(case.scene(1e-3), steps=round(case.timed_from / 1e-3))
+    moved = motion.simulate(scene, scene.steps, device="cpu")
+    return moved.pose[-1], moved.velocity[-1]
+
+
 def part(case: Case, h: float, env_step: float = 0.0) -> Scene:
     """The batch that is timed, if a step of an environment takes about so many seconds."""
-    scene = case.scene(h, envs(case.name))
-    most = TURN / (env_step * scene.envs) if env_step else math.inf
-    return replace(scene, steps=int(min(scene.steps, max(20, round(TIMED / h)), max(10, most))))
+    pose, velocity = settled(case.name)
+    scene = replace(case.scene(h), pose=pose, velocity=velocity)
+    number = max(20, round(TIMED / h))
+    most = TURN / (env_step * number) if env_step else math.inf
+    return replace(scene.copies(int(min(envs(case.name), max(LEAST_ENVS, most)))), steps=number)
+
+
+def energy_errors(moved: Motion) -> dict[str, float | None]:
+    """What the timed part's steps miss of the laws [J], and what gravity gives in a step; of a motion that is sampled at every step."""
+    if moved.scene.restitution:
+        return {"E_uc": None, "E_uc_of_a_fall": None}
+    return {"E_uc": energy_error.largest(moved), "E_uc_of_a_fall": energy_error.of_a_fall(moved.scene)}
 
 
 def spread(seconds: list[float], scene: Scene) -> dict[str, float]:
-    """Time per environment and step [s], median of the repetitions, and their range over it."""
+    """Time per environment and step [s], median of the turns, their range over it, and of what it was taken."""
     each = [s / (scene.envs * scene.steps) for s in seconds]
     median = statistics.median(each)
-    return {"step_s": median, "spread": (max(each) - min(each)) / median, "per_ms_us": 1e6 * median / (1e3 * scene.dt)}
+    per_ms = 1e6 * median / (1e3 * scene.dt)
+    return {"step_s": median, "spread": (max(each) - min(each)) / median, "per_ms_us": per_ms, "envs": scene.envs, "steps": scene.steps}
 
 
 Clock = Callable[[], float]
@@ -130,14 +149,19 @@ def ours_at(case: Case, h: float, device: Any) -> tuple[list[dict[str, Any]], li
     """Our points at a step, and what times each of them once."""
     points, clocks = [], []
     for curve in OURS:
-        if (curve.directions and h != KNOB_STEP) or (curve.name in SLOW and case.name in MANY):
+        if curve.directions and h != KNOB_STEP:
             continue
         for k in curve.directions or (None,):
             options = curve.options | ({} if k is None else {"directions": k})
-            moved = case.simulate(h, device=device, **options)
             knob = f"{1e3 * h:g} ms" if k is None else f"k = {k}"
-            points.append(point(case, moved, "warp_lcp", curve.name, knob, h))
             scene = part(case, h)
+            try:
+                moved = case.simulate(h, device=device, limit=PATIENCE, **options)
+            except motion.TooSlow as why:
+                points.append({"case": case.name, "engine": "warp_lcp", "setting": curve.name, "knob": knob, "h": h, "left_out": str(why)})
+                continue
+            points.append(point(case, moved, "warp_lcp", curve.name, knob, h))
+            points[-1] |= energy_errors(motion.simulate(scene.copies(1), device=device, **options))
             sim = scene.simulator(device=device, **options)
 
             def clock(sim=sim, scene=scene) -> float:
@@ -162,34 +186,29 @@ def theirs_at(
     points, tasks = [], []
     for each in sessions:
         for variant in each.peer.variants:
-            name = each.peer.name
-            if h < 0.99 * LEAST.get(name, USUAL_LEAST):
-                continue
-            scene = case.scene(h)
-            row = {"case": case.name, "engine": name, "setting": variant, "knob": f"{1e3 * h:g} ms", "h": h}
-            expected = known.get((name, variant), 0.0) * scene.steps
-            if expected > PATIENCE:
-                points.append(row | {"left_out": f"a run would take {expected:.0f} s"})
-                tasks.append(None)
-                continue
+            name, scene = each.peer.name, case.scene(h)
+            row: dict[str, Any] = {"case": case.name, "engine": name, "setting": variant, "knob": f"{1e3 * h:g} ms", "h": h}
+            expected = known.get((name, variant), 0.0) * scene.steps * scene.envs
             try:
-                begin = time.perf_counter()
+                if expected > PATIENCE:
+                    raise Refused(f"a run would take {expected:.0f} s")
                 whole = each.make(variant, scene, case.every(h))
-                known[name, variant] = (time.perf_counter() - begin) / scene.steps
-                before = (whole.before_pose, whole.before_velocity)
-                moved = Motion.of(scene, whole.pose, whole.velocity, whole.contacts, before=before)
+                known[name, variant] = whole.recorded_s / (scene.steps * scene.envs)
                 problems = compare.problems(scene, whole)
                 whole.drop()
-                short = part(case, h, known[name, variant] / scene.envs)
-                timed = (each.make(variant, short), short)
+                short = part(case, h, known[name, variant])
+                timed = each.make(variant, short)
             except (Refused, PeerError) as why:
                 if each.process.poll() is not None:
                     raise
                 points.append(row | {"left_out": str(why).strip().splitlines()[-1]})
                 tasks.append(None)
                 continue
-            points.append(point(case, moved, name, variant, row["knob"], h) | {"problems": problems, "versions": each.versions})
-            tasks.append(timed)
+            row = point(case, Motion.of(scene, whole.pose, whole.velocity, whole.contacts), name, variant, row["knob"], h)
+            before = (timed.before_pose, timed.before_velocity)
+            row |= energy_errors(Motion.of(short, timed.pose, timed.velocity, timed.contacts, before=before))
+            points.append(row | {"problems": problems, "versions": each.versions})
+            tasks.append((timed, short))
     return points, tasks
 
 
@@ -197,20 +216,28 @@ def at(case: Case, h: float, sessions: list[Session], known: dict[tuple[str, str
     """All points of a case at a step, timed in turns."""
     mine, clocks = ours_at(case, h, device)
     theirs, tasks = theirs_at(case, h, sessions, known)
-    running = [*clocks, *(pair[0].repeat for pair in tasks if pair is not None)]
-    seconds: list[list[float]] = [[] for _ in running]
+    seconds: list[list[float]] = [[] for _ in clocks]
     for _ in range(TURNS):
-        for clock, into in zip(running, seconds, strict=True):
+        for clock, into in zip(clocks, seconds, strict=True):
             into.append(turn(clock))
+        for i, (row, task) in enumerate(zip(theirs, tasks, strict=True)):
+            if task is not None:
+                try:
+                    row.setdefault("turns", []).append(turn(task[0].repeat))
+                except PeerError as why:
+                    if task[0].session.process.poll() is not None:
+                        raise
+                    row["left_out"], tasks[i] = str(why).strip().splitlines()[-1], None
     scene, measured = part(case, h), iter(seconds)
     for row in mine:
-        row |= spread(next(measured), scene)
-    for row, pair in zip(theirs, tasks, strict=True):
-        if pair is not None:
-            task, short = pair
-            row |= spread(next(measured), short)
-            row["problems"] += [problem for problem in compare.problems(short, task) if problem not in row["problems"]]
-            task.drop()
+        if "left_out" not in row:
+            row |= spread(next(measured), scene)
+    for row, task in zip(theirs, tasks, strict=True):
+        if task is not None:
+            done, short = task
+            row |= spread(row.pop("turns"), short)
+            row["problems"] += [problem for problem in compare.problems(short, done) if problem not in row["problems"]]
+            done.drop()
     return mine + theirs
 
 
@@ -234,25 +261,42 @@ def measure(names: list[str], peers: list[Peer], folder: Path, device: Any, quic
 
 
 def counts(row: dict[str, Any]) -> bool:
-    """Is the row a point of the chart: simulated, finite, with nothing against it, and certified if it is ours?"""
-    if "left_out" in row or not row["finite"] or row.get("problems"):
-        return False
-    return row["certified"] is None or row["certified"] >= 0.999
+    """Is the row a point of the chart?"""
+    return not against(row)
+
+
+def against(row: dict[str, Any]) -> str:
+    """Why a row is no point of the chart; '' if it is one."""
+    if "left_out" in row:
+        return row["left_out"]
+    found = list(row.get("problems", []))
+    if not row["finite"] or not np.isfinite(row["error"]):
+        found.append("not a number")
+    elif not row["energy_rise"] <= stability.BLOWN:
+        found.append(f"blew up: energy rises by {row['energy_rise']:.1g} of its scale")
+    if row["certified"] is not None and not row["certified"] >= stability.CERTIFIED:
+        found.append(f"{100 * row['certified']:.3g} % certified")
+    return "; ".join(found)
+
+
+def error(row: dict[str, Any]) -> float:
+    """Of a row; none is less than round-off."""
+    return max(row["error"], ROUND_OFF)
 
 
 def front(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Those that no other of them beats in both, from fast to slow."""
     best, kept = np.inf, []
-    for row in sorted(rows, key=lambda row: (row["per_ms_us"], row["error"])):
-        if row["error"] < best:
-            best = row["error"]
+    for row in sorted(rows, key=lambda row: (row["per_ms_us"], error(row))):
+        if error(row) < best:
+            best = error(row)
             kept.append(row)
     return kept
 
 
 def beaten(row: dict[str, Any], mine: list[dict[str, Any]]) -> bool:
     """Is one of ours both faster and more accurate?"""
-    return any(own["per_ms_us"] < row["per_ms_us"] and own["error"] < row["error"] for own in mine)
+    return any(own["per_ms_us"] < row["per_ms_us"] and error(own) < error(row) for own in mine)
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
@@ -295,7 +339,5 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     if out:
         lines += ["", "Not in the chart:", ""]
         for row in out:
-            why = row.get("left_out") or "; ".join(row.get("problems", [])) or ("not finite" if not row["finite"] else "")
-            why = why or f"{100 * row['certified']:.3g} % certified"
-            lines.append(f"- {row['case']}: {row['engine']} {row['setting']}, {row['knob']}: {why}")
+            lines.append(f"- {row['case']}: {row['engine']} {row['setting']}, {row['knob']}: {against(row)}")
     return "\n".join(lines)

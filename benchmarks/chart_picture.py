@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from .cases import CASES
-from .chart import beaten, counts, front
+from .cases.sliding import box_reference
+from .chart import ROUND_OFF, beaten, counts, front
 from .pictures import pyplot, save
 
 STYLE = {"font_size": 11, "axes_linewidth": 0.7, "svg_fonttype": "none"}
 
-#: Errors and energies under these are drawn there: round-off is no accuracy.
-LEAST_ERROR, LEAST_ENERGY = 1e-12, 1e-18
+LEAST_ENERGY = 1e-18  # J: energies under it are drawn there
 #: Colour, line, marker, size and label of our curves and of other engines; each differs in more than colour.
 OURS = {
     "default": ("#000000", "-", "o", 6.5, "warp_lcp"),
@@ -69,7 +69,7 @@ def curves(rows: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, A
 
 def panel(axis: Any, rows: list[dict[str, Any]], key: str, least: float, titles: dict[str, str]) -> None:
     """One case: every engine's curves, and the front of them all."""
-    kept = [row | {"error": max(row[key], least), "told": title(row)} for row in rows if np.isfinite(row[key])]
+    kept = [row | {"error": max(row[key], least), "told": title(row)} for row in rows if row.get(key) is not None]
     best = front(kept)
     if best:
         x = np.repeat([row["per_ms_us"] for row in best], 2)[1:]
@@ -105,7 +105,7 @@ def draw(rows: list[dict[str, Any]], path: Path, key: str = "error") -> list[Pat
     figure, axes = plt.subplots(lines, columns, figsize=(13.0, 4.2 * lines + 1.2), squeeze=False)
     titles: dict[str, str] = {}
     for axis, name in zip(axes.flat, cases, strict=False):
-        panel(axis, [row for row in good if row["case"] == name], key, LEAST_ERROR if key == "error" else LEAST_ENERGY, titles)
+        panel(axis, [row for row in good if row["case"] == name], key, ROUND_OFF if key == "error" else LEAST_ENERGY, titles)
         metric = CASES[name].metrics[0]
         axis.set_title(CASES[name].label or name, fontsize=12)
         axis.set_ylabel(f"{metric.name} off by [{metric.unit}]" if key == "error" else "$E_{uc}$, worst step [J]")
@@ -133,7 +133,7 @@ def draw(rows: list[dict[str, Any]], path: Path, key: str = "error") -> list[Pat
 
 
 def summary(axis: Any, good: list[dict[str, Any]], cases: list[str], key: str) -> None:
-    """Of each engine's points: one of ours is faster and more accurate; only one of the two; neither."""
+    """Of each engine's points: the share of which one of ours is both faster and more accurate."""
     engines = [engine for engine in THEIRS if any(row["engine"] == engine for row in good)]
     shares = []
     for engine in engines:
@@ -178,7 +178,7 @@ def draw_box(rows: list[dict[str, Any]], path: Path) -> list[Path]:
     side.set_xlabel("time [s]")
     side.set_ylabel("height above the ground [m]")
     figure.legend(loc="lower center", ncols=3, frameon=False, fontsize=9)
-    above.plot(0.4406458032, 1.5839676389, "*", color="0.75", markersize=16, markeredgecolor="0.3", zorder=1)
+    above.plot(*box_reference()[:2], "*", color="0.75", markersize=16, markeredgecolor="0.3", zorder=1)
     above.set_aspect("equal", adjustable="box")
     above.set_xlabel("x [m]")
     above.set_ylabel("y [m]")

@@ -2,14 +2,15 @@
 """By how much energy a step of any engine misses Newton's law and the exact Coulomb cone together.
 
 Engines differ in what they report of their contacts, and many report nothing; what all have is the state before and after
-a step. So the impulses are those that make the step look best: the smallest, over all contact impulses r, of
+a step. So the impulses are those that make the step look best: the smallest found, over all contact impulses r, of
 
     1/2 |v+ - v_free - M^-1 J^T r|_M^2  +  E_uc(u+, r),      u+ = J v+
 
 in J, where E_uc is the unit-consistent error of Enzenhoefer, Peiret and others (a sum of 1/2 m_n min(u_n, r_n / m_n)^2 and
-1/2 m_t |(r_t - P_disc(r_t - m_t u_t)) / m_t|^2 with the contacts' effective masses m_n, m_t). It is zero for, and only for, a step
-that obeys both laws, and needs no impulse of the engine's own. Contacts are those that our collision detection finds at the state
-before the step; an open one has u_n + gap / h for u_n, as it may close.
+1/2 m_t |(r_t - P_disc(r_t - m_t u_t)) / m_t|^2 with the contacts' effective masses m_n, m_t). It is zero for a step that obeys both
+laws, and for no other; it needs no impulse of the engine's own. A local search from two starts finds it: an upper bound. Contacts are
+those that our collision detection finds at the state before the step; an open one has u_n + gap / h for u_n, as it may close.
+There is no restitution in it.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from scipy.optimize import least_squares
 from .motion import Motion
 from .scenes import Scene
 
-SAMPLES = 12
+FIRST, SPREAD = 6, 10  # steps: the first ones, where convex laws throw a body that slides, and others over the motion
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,11 @@ class Step:
 
 
 def steps(moved: Motion) -> list[Step]:
-    """Some of the steps of a motion whose states one step before each sample are known, spread over it."""
+    """Some of the steps of a motion that is sampled at every step, or else of those before its samples."""
     assert moved.before is not None
     scene, (before_pose, before_velocity) = moved.scene, moved.before
-    chosen = np.unique(np.linspace(0, len(before_pose) - 1, SAMPLES).astype(int))
+    last = len(before_pose) - 1
+    chosen = np.unique(np.r_[np.arange(min(FIRST, last + 1)), np.linspace(0, last, SPREAD).astype(int)])
     # One environment of each sample, another one every time.
     envs = np.arange(len(chosen)) % scene.envs
     first: Scene = replace(scene, pose=before_pose[chosen, envs], velocity=before_velocity[chosen, envs])
@@ -107,7 +109,7 @@ def steps(moved: Motion) -> list[Step]:
 
 def largest(moved: Motion) -> float:
     """Over the chosen steps [J]; NaN where a state is not a number."""
-    return max(step.energy() for step in steps(moved)) if moved.finite else float("nan")
+    return float(np.max([step.energy() for step in steps(moved)])) if moved.finite else float("nan")
 
 
 def of_a_fall(scene: Scene) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -109,14 +109,13 @@ def simulate(scene: Scene, every: int = 1, material: dict[str, Any] | None = Non
     return record(scene.simulator(material=material, **options), scene, every, limit)
 
 
-def penetration(scene: Scene, final: np.ndarray) -> float:
-    """Deepest overlap [m] of anybody's final poses, measured by our collision detection; NaN for poses that are not finite."""
-    if not np.isfinite(final).all():
+def penetration(scene: Scene, poses: np.ndarray) -> float:
+    """Deepest overlap [m] of anybody's poses [..., B, 7], measured by our collision detection; NaN if they are not finite."""
+    if not np.isfinite(poses).all():
         return float("nan")
-    sim = scene.simulator(device="cpu")
-    sim.q0.assign(final.reshape(scene.envs, -1))
-    sim.v0.zero_()
-    sim.reset()
+    flat = poses.reshape(-1, *poses.shape[-2:])
+    still = replace(scene, pose=flat, velocity=np.zeros((len(flat), flat.shape[1], 6)))
+    sim = still.simulator(device="cpu")
     sim.step()
     gap, count = sim.contacts.gap.numpy(), sim.contacts.count.numpy()
     return max(0.0, -float(np.min(gap, where=np.arange(gap.shape[1]) < count[:, None], initial=0.0)))

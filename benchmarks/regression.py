@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What got worse since the results that were kept last.
 
-Errors and verdicts are the same on every machine, so they are compared as they are; times only as ratios to what was timed in
-the same run: of ours to another engine, or of one of our settings to the default.
+Errors and verdicts are the same on every machine (but for what was too slow), so they are compared as they are; times only as
+ratios to what was timed in the same run.
 """
 
 from __future__ import annotations
@@ -12,64 +12,92 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from .cases.case import ENERGY_RISE
+
 #: An error is worse if it grew by this factor, and by more than rounding.
 ERROR, ROUNDING = 1.05, 1e-9
 #: A ratio of times is worse if it fell by this factor and its range lies below the old one.
 RATIO = 1.2
-VERDICTS = ("survived", "drifted", "wrong", "blew up")
+VERDICTS = ("survived", "drifted", "wrong", "blew up", "too slow", "refused")
 
 
 def accuracy(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Errors that grew."""
-    before = {
-        (row["case"], row["law"], row["metric"], h): error for row in old["rows"] for h, error in zip(row["h"], row["total"], strict=True)
-    }
-    found = []
-    for row in new["rows"]:
-        for h, error in zip(row["h"], row["total"], strict=True):
-            was = before.get((row["case"], row["law"], row["metric"], h))
-            if was is not None and not error <= ERROR * was + ROUNDING:
-                found.append(f"{row['case']}, {row['law']}, {row['metric']} at {1e3 * h:g} ms: {error:.2e} {row['unit']}, was {was:.2e}")
+    """Errors, of the law too, that grew; bars that are missed now; less that is certified; rows that are gone."""
+
+    def keyed(data: dict[str, Any]) -> dict[tuple[Any, ...], dict[str, Any]]:
+        names = ("total", "model", "within", "certified", "energy_rise")
+        return {
+            (row["case"], row["law"], row["metric"], h): {name: row[name][i] for name in names} | {"unit": row["unit"]}
+            for row in data["rows"]
+            for i, h in enumerate(row["h"])
+        }
+
+    before, after, found = keyed(old), keyed(new), []
+    for key, was in before.items():
+        where, now = f"{key[0]}, {key[1]}, {key[2]} at {1e3 * key[3]:g} ms", after.get(key)
+        if now is None:
+            found.append(f"{where}: not measured any more")
+            continue
+        for name, said in (("total", "off by"), ("model", "the law off by")):
+            if not now[name] <= ERROR * was[name] + ROUNDING:
+                found.append(f"{where}: {said} {now[name]:.2e} {now['unit']}, was {was[name]:.2e}")
+        if was["within"] and not now["within"]:
+            found.append(f"{where}: over its bar")
+        if not now["certified"] >= was["certified"]:
+            found.append(f"{where}: {100 * now['certified']:.4g} % certified, was {100 * was['certified']:.4g} %")
+        if not now["energy_rise"] <= max(was["energy_rise"], ENERGY_RISE):
+            found.append(f"{where}: energy up by {now['energy_rise']:.1e}, was {was['energy_rise']:.1e}")
     return found
 
 
 def stability(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Verdicts that are worse, and randomised copies that lost more."""
-    before = {(row["case"], row["variant"], row["h"]): row["verdict"] for row in old["rows"]}
-    found = []
-    for row in new["rows"]:
-        was, now = before.get((row["case"], row["variant"], row["h"])), row["verdict"]
-        if was in VERDICTS and (now not in VERDICTS or VERDICTS.index(now) > VERDICTS.index(was)):
-            found.append(f"{row['case']}, {row['variant']} at {1e3 * row['h']:g} ms: {now}, was {was}: {row['reason']}")
-    lost = {row["scene"]: row["status"] for row in old.get("crowds", [])}
+    """Verdicts that are worse, and randomised copies that lost more, where as many ran. What was too slow may be so again elsewhere."""
+
+    def keyed(data: dict[str, Any]) -> dict[tuple[Any, ...], dict[str, Any]]:
+        return {(row["case"], row["variant"], row["h"]): row for row in data["rows"]}
+
+    before, after, found = keyed(old), keyed(new), []
+    for key, was in before.items():
+        where, row = f"{key[0]}, {key[1]} at {1e3 * key[2]:g} ms", after.get(key)
+        if row is None:
+            found.append(f"{where}: not run any more")
+        elif VERDICTS.index(row["verdict"]) > VERDICTS.index(was["verdict"]):
+            found.append(f"{where}: {row['verdict']}, was {was['verdict']}: {row['reason']}")
+    known = {(row["scene"], row["envs"]): row for row in old.get("crowds", [])}
     for row in new.get("crowds", []):
-        for bit in ("UNCERTIFIED", "NOT_A_NUMBER"):
-            if row["scene"] in lost and row["status"][bit] > lost[row["scene"]][bit]:
-                found.append(f"{row['scene']}, randomised: {row['status'][bit]} {bit}, was {lost[row['scene']][bit]}")
+        if lost := known.get((row["scene"], row["envs"])):
+            pairs = {bit: (row["status"][bit], lost["status"][bit]) for bit in ("UNCERTIFIED", "NOT_A_NUMBER")}
+            pairs |= {name: (row[name], lost[name]) for name in ("spoilt_envs", "not_finite")}
+            found += [f"{row['scene']}, randomised: {now} {name}, was {was}" for name, (now, was) in pairs.items() if now > was]
     return found
 
 
 def chart(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
-    """Errors of ours that grew; ratios of the others' times to our default's that fell."""
+    """Errors of ours that grew and points that are lost; ratios to our default, or to its own `coulomb`, that got worse."""
 
     def keyed(data: dict[str, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
         return {tuple(row[name] for name in ("case", "engine", "setting", "knob")): row for row in data["rows"] if "per_ms_us" in row}
 
-    def ratio(rows: dict[tuple[str, ...], dict[str, Any]], key: tuple[str, ...]) -> tuple[float, float]:
-        own = rows.get((key[0], "warp_lcp", "default", key[3]))
-        return (rows[key]["step_s"] / own["step_s"], rows[key]["spread"] + own["spread"]) if own else (1.0, 0.0)
+    def ratio(rows: dict[tuple[str, ...], dict[str, Any]], key: tuple[str, ...]) -> tuple[float, float] | None:
+        beside = "coulomb" if key[1:3] == ("warp_lcp", "default") else "default"
+        own = next((r for k, r in rows.items() if k[:3] == (key[0], "warp_lcp", beside) and r["h"] == rows[key]["h"]), None)
+        return (rows[key]["step_s"] / own["step_s"], rows[key]["spread"] + own["spread"]) if own else None
 
     before, after, found = keyed(old), keyed(new), []
-    for key, row in after.items():
-        if key not in before:
+    for key, was in before.items():
+        where, row, ours = ", ".join(key), after.get(key), key[1] == "warp_lcp"
+        if row is None:
+            found.append(f"{where}: no point any more")
             continue
-        was = before[key]
-        if key[1] == "warp_lcp" and not row["error"] <= ERROR * was["error"] + ROUNDING:
-            found.append(f"{', '.join(key)}: error {row['error']:.2e} {row['unit']}, was {was['error']:.2e}")
-        (then, noise), (now, noise_now) = ratio(before, key), ratio(after, key)
-        change = then / now if key[1] != "warp_lcp" else now / then
-        if change > RATIO + 0.5 * (noise + noise_now):
-            found.append(f"{', '.join(key)}: time over that of our default {now:.2f}, was {then:.2f}")
+        if ours and not row["error"] <= ERROR * was["error"] + ROUNDING:
+            found.append(f"{where}: error {row['error']:.2e} {row['unit']}, was {was['error']:.2e}")
+        if ours and not row["certified"] >= was["certified"]:
+            found.append(f"{where}: {100 * row['certified']:.4g} % certified, was {100 * was['certified']:.4g} %")
+        then, now = ratio(before, key), ratio(after, key)
+        if then and now and (now[0] / then[0] if ours else then[0] / now[0]) > RATIO + 0.5 * (then[1] + now[1]):
+            found.append(
+                f"{where}: time over that of our {'coulomb' if key[2] == 'default' and ours else 'default'} {now[0]:.2f}, was {then[0]:.2f}"
+            )
     return found
 
 
@@ -98,10 +126,17 @@ KINDS: dict[str, Callable[[dict[str, Any], dict[str, Any]], list[str]]] = {
 
 
 def last(path: Path, folder: Path) -> Path | None:
-    """The kept result of the same command and kind of device before this one; None if there is none."""
-    kind = path.name.split("-", 3)[3]
-    kept = [other for other in sorted(folder.glob(f"*-{kind}")) if other.resolve() != path.resolve()]
-    return kept[-1] if kept else None
+    """The kept result of the same command and kind of device that comes before this one, or is it; None if there is none.
+
+    Raises:
+        ValueError: if the name is not that of a result.
+    """
+    parts = path.name.split("-", 3)
+    if len(parts) < 4:
+        raise ValueError(f"{path} is not called <date>-<command>-<device>.json: name the result to compare with")
+    kept = [other for other in sorted(folder.glob(f"*-{parts[3]}")) if other.name <= path.name]
+    others = [other for other in kept if other.resolve() != path.resolve()]
+    return others[-1] if others else None
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -119,13 +154,12 @@ def read(path: Path) -> dict[str, Any]:
     return data
 
 
-def worse(old: Path, new: Path) -> list[str]:
+def worse(before: dict[str, Any], after: dict[str, Any]) -> list[str]:
     """A line for everything that got worse.
 
     Raises:
         ValueError: where the two cannot be compared.
     """
-    before, after = read(old), read(new)
     if before["what"] != after["what"]:
-        raise ValueError(f"{old} is of '{before['what']}', {new} of '{after['what']}': compare the same")
+        raise ValueError(f"one is a result of '{before['what']}', the other of '{after['what']}': compare the same")
     return KINDS[after["what"]](before, after)

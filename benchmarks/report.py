@@ -15,6 +15,8 @@ import warp as wp
 
 ROOT = Path(__file__).parents[1]
 DOCS, RESULTS = ROOT / "docs", ROOT / "benchmarks" / "results"
+PARTIAL = ROOT / "build" / "benchmarks"  # of runs that leave something out
+STAMP = datetime.date.today().isoformat()  # one for a run, however late it ends
 END = "<!-- end of the tables -->\n"
 
 
@@ -25,12 +27,16 @@ def processor() -> str:
     return names[0] if names else platform.processor()
 
 
+def path_of(folder: Path, what: str, device: wp.Device) -> Path:
+    """folder/<date>-<what>-<device>.json"""
+    return folder / f"{STAMP}-{what}-{'cuda' if device.is_cuda else 'cpu'}.json"
+
+
 def write(folder: Path, what: str, device: wp.Device, data: dict[str, Any]) -> Path:
-    """Write data with its circumstances to folder/<date>-<what>-<device>.json; returns the path."""
-    stamp = datetime.date.today().isoformat()
+    """Write data with its circumstances; returns the path."""
     header = {
         "what": what,
-        "date": stamp,
+        "date": STAMP,
         "device": device.name if device.is_cuda else processor(),
         "cores": os.cpu_count(),
         "load": os.getloadavg()[0],
@@ -39,7 +45,7 @@ def write(folder: Path, what: str, device: wp.Device, data: dict[str, Any]) -> P
         "warp": wp.config.version,
     }
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{stamp}-{what}-{'cuda' if device.is_cuda else 'cpu'}.json"
+    path = path_of(folder, what, device)
     path.write_text(json.dumps(header | data, indent=1) + "\n")
     return path
 

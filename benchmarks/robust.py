@@ -77,7 +77,7 @@ def count(name: str, sim: wl.Simulator, steps: int, start: Callable[[wl.Simulato
     spoilt, begin = np.zeros(envs, dtype=bool), time.perf_counter()
     for _ in tqdm(range(steps), desc=name, disable=None, leave=False):
         sim.step()
-        status, residual = sim.status.numpy(), sim.residual.numpy()
+        status, residual = sim.status.numpy(), np.where(np.isnan(sim.residual.numpy()), np.inf, sim.residual.numpy())
         for bit in wl.Status:
             if bit:
                 bits[bit.name] += int(np.count_nonzero(status & bit))

@@ -11,7 +11,7 @@ import pytest
 from test_benchmarks import FAKE
 
 from benchmarks import __main__ as command
-from benchmarks import accuracy, chart, chart_picture, peers, pictures, regression, report, stability_picture
+from benchmarks import accuracy, chart, chart_picture, peers, pictures, regression, report, stability, stability_picture
 from benchmarks.cases import CASES
 
 ROOT = Path(__file__).parents[1]
@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[1]
 def point(engine="warp_lcp", setting="default", time=1.0, error=1.0, h=1e-2, **more):
     """A row of the chart: time in us per ms."""
     row = {"case": "box", "engine": engine, "setting": setting, "knob": f"{1e3 * h:g} ms", "h": h, "error": error, "unit": "m"}
-    row |= {"finite": True, "certified": 1.0 if engine == "warp_lcp" else None, "E_uc": error**2, "residual": None}
+    row |= {"finite": True, "certified": 1.0 if engine == "warp_lcp" else None, "E_uc": error**2, "residual": None, "energy_rise": 0.0}
     return row | {"per_ms_us": time, "step_s": 1e-3 * time * h, "spread": 0.1} | more
 
 
@@ -36,18 +36,26 @@ def test_beaten_in_both():
     assert not chart.beaten(point("mujoco", time=2.0, error=1.5), mine)
     assert not chart.beaten(point("mujoco", time=0.5, error=9.0), mine)
     assert not chart.beaten(point("mujoco", time=1.0, error=2.0), mine)
+    assert not chart.beaten(point("mujoco", time=9.0, error=1e-13), [point(error=1e-15)])  # both are round-off
 
 
 @pytest.mark.parametrize(
-    "more", [{"left_out": "slow"}, {"finite": False}, {"problems": ["state not finite"]}, {"certified": 0.99}], ids=lambda more: str(more)
+    ("more", "reason"),
+    [
+        ({"left_out": "slow"}, "slow"),
+        ({"finite": False}, "not a number"),
+        ({"error": np.nan}, "not a number"),
+        ({"problems": ["timed and recorded runs differ"]}, "timed and recorded runs differ"),
+        ({"certified": 0.99}, "99 % certified"),
+        ({"energy_rise": 30.0}, "blew up: energy rises by 3e+01 of its scale"),
+        ({"energy_rise": np.nan}, "blew up"),
+    ],
 )
-def test_what_is_no_point_is_told(more):
+def test_what_is_no_point_is_told(more, reason):
     """It is neither drawn nor beaten, and stands in the list with its reason."""
     row = point("mujoco", "elliptic") | more
     assert not chart.counts(row)
     text = chart.markdown([point(), row])
-    reason = {"finite": "not finite", "certified": "99 % certified"}.get(next(iter(more)), "s")
-    assert "Not in the chart:" in text
     assert reason in text.partition("Not in the chart:")[2]
 
 
@@ -79,6 +87,7 @@ def test_measured_points(fake, tmp_path, monkeypatch):
     mine = {row["setting"]: row for row in rows if row["engine"] == "warp_lcp"}
     theirs = {row["setting"]: row for row in rows if row["engine"] == "fake"}
     assert set(mine) == {"default", "midpoint", "coulomb", "float32", "lemke", "pgs"}
+    assert {row["envs"] for row in (*mine.values(), theirs["plain"])} == {2}
     assert mine["midpoint"]["error"] < 0.02 * mine["default"]["error"]
     assert mine["coulomb"]["E_uc"] < 1e-12 < theirs["plain"]["E_uc"]
     # It glides at 2 m/s: from the ball that spins backwards it is farthest.
@@ -132,38 +141,71 @@ def test_picture_of_stability(tmp_path):
 # ---------------------------------------------------------------------------------------------------------------------- regression
 
 
-def test_worse_accuracy():
-    row = {"case": "box", "law": "default", "metric": "x", "unit": "m", "h": [1e-2, 1e-3], "total": [1e-2, 1e-3]}
-    old = {"rows": [row]}
-    assert regression.accuracy(old, old) == []
-    assert regression.accuracy(old, {"rows": [row | {"total": [0.9e-2, 1e-3]}]}) == []
-    assert regression.accuracy(old, {"rows": [row | {"total": [1e-2, 1.2e-3]}]}) == ["box, default, x at 1 ms: 1.20e-03 m, was 1.00e-03"]
-    assert len(regression.accuracy(old, {"rows": [row | {"total": [np.nan, 1e-3]}]})) == 1
+def kept_accuracy(**more) -> dict:
+    row = {"case": "box", "law": "default", "metric": "x", "unit": "m", "h": [1e-2, 1e-3], "total": [1e-2, 1e-3], "model": [1e-4, 0.0]}
+    return {"rows": [row | {"within": [True, True], "certified": [1.0, 1.0], "energy_rise": [0.0, 0.0]} | more]}
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"total": [0.9e-2, 1e-3]}, []),
+        ({"energy_rise": [1e-9, 0.0]}, []),
+        ({"total": [1e-2, 1.2e-3]}, ["at 1 ms: off by 1.20e-03 m, was 1.00e-03"]),
+        ({"total": [np.nan, 1e-3]}, ["at 10 ms: off by nan m, was 1.00e-02"]),
+        ({"model": [7e-3, 0.0]}, ["at 10 ms: the law off by 7.00e-03 m, was 1.00e-04"]),
+        ({"within": [True, False]}, ["at 1 ms: over its bar"]),
+        ({"certified": [0.5, 1.0]}, ["at 10 ms: 50 % certified, was 100 %"]),
+        ({"energy_rise": [0.5, 0.0]}, ["at 10 ms: energy up by 5.0e-01, was 0.0e+00"]),
+    ],
+)
+def test_worse_accuracy(more, said):
+    assert regression.accuracy(kept_accuracy(), kept_accuracy(**more)) == [f"box, default, x {words}" for words in said]
+
+
+def test_rows_that_are_gone_are_worse():
+    assert len(regression.accuracy(kept_accuracy(), {"rows": []})) == 2
+    assert regression.chart({"rows": [point()]}, {"rows": []}) == ["box, warp_lcp, default, 10 ms: no point any more"]
+    row = {"case": "box", "variant": "pgs", "h": 1e-2, "verdict": "drifted", "reason": "creep"}
+    assert regression.stability({"rows": [row]}, {"rows": []}) == ["box, pgs at 10 ms: not run any more"]
 
 
 def test_worse_stability():
     row = {"case": "box", "variant": "pgs", "h": 1e-2, "verdict": "drifted", "reason": "creep"}
-    crowd = {"scene": "box", "status": {"UNCERTIFIED": 1, "NOT_A_NUMBER": 0}}
+    crowd = {"scene": "box", "envs": 64, "status": {"UNCERTIFIED": 1, "NOT_A_NUMBER": 0}, "spoilt_envs": 1, "not_finite": 0}
     old = {"rows": [row], "crowds": [crowd]}
     assert regression.stability(old, old) == []
     assert regression.stability(old, {"rows": [row | {"verdict": "survived"}]}) == []
     assert regression.stability(old, {"rows": [row | {"verdict": "wrong"}]}) == ["box, pgs at 10 ms: wrong, was drifted: creep"]
     assert len(regression.stability(old, {"rows": [row | {"verdict": "too slow"}]})) == 1
-    lost = {"rows": [], "crowds": [{"scene": "box", "status": {"UNCERTIFIED": 1, "NOT_A_NUMBER": 2}}]}
-    assert regression.stability(old, lost) == ["box, randomised: 2 NOT_A_NUMBER, was 0"]
+    assert len(regression.stability({"rows": [row | {"verdict": "too slow"}]}, {"rows": [row]})) == 0
+    lost = crowd | {"status": {"UNCERTIFIED": 1, "NOT_A_NUMBER": 2}, "spoilt_envs": 3}
+    assert regression.stability(old, {"rows": [row], "crowds": [lost]}) == [
+        "box, randomised: 2 NOT_A_NUMBER, was 0",
+        "box, randomised: 3 spoilt_envs, was 1",
+    ]
+    assert regression.stability(old, {"rows": [row], "crowds": [lost | {"envs": 4096}]}) == []
 
 
 def test_worse_chart():
     """Times count as ratios in a run: a machine of half the speed is not worse."""
-    old = {"rows": [point(), point("mujoco", time=4.0), point(setting="lemke", time=8.0)]}
-    slower = {"rows": [row | {"step_s": 2 * row["step_s"]} for row in old["rows"]]}
-    assert regression.chart(old, slower) == []
-    ours = {"rows": [point(time=2.0), *old["rows"][1:]]}
-    assert regression.chart(old, ours) == ["box, mujoco, default, 10 ms: time over that of our default 2.00, was 4.00"]
-    lemke = {"rows": [*old["rows"][:2], point(setting="lemke", time=16.0)]}
-    assert regression.chart(old, lemke) == ["box, warp_lcp, lemke, 10 ms: time over that of our default 16.00, was 8.00"]
-    off = {"rows": [point(error=1.2), *old["rows"][1:]]}
-    assert regression.chart(old, off) == ["box, warp_lcp, default, 10 ms: error 1.20e+00 m, was 1.00e+00"]
+    rows = [point(), point(setting="coulomb", time=2.0), point("mujoco", time=4.0), point(setting="AP", time=8.0, knob="k = 2")]
+    old = {"rows": rows}
+
+    def worse(*changed) -> list[str]:
+        return regression.chart(old, {"rows": [row | changed[i] if i < len(changed) else row for i, row in enumerate(rows)]})
+
+    assert worse(*({"step_s": 2 * row["step_s"]} for row in rows)) == []
+    assert worse({}, {}, {}, {"step_s": 2 * rows[3]["step_s"]}) == [
+        "box, warp_lcp, AP, k = 2: time over that of our default 16.00, was 8.00"
+    ]
+    slow = worse({"step_s": 2 * rows[0]["step_s"]})
+    assert slow == [
+        "box, warp_lcp, default, 10 ms: time over that of our coulomb 1.00, was 0.50",
+        "box, mujoco, default, 10 ms: time over that of our default 2.00, was 4.00",
+    ]
+    assert worse({"error": 1.2}) == ["box, warp_lcp, default, 10 ms: error 1.20e+00 m, was 1.00e+00"]
+    assert worse({"certified": 0.0}) == ["box, warp_lcp, default, 10 ms: 0 % certified, was 100 %"]
 
 
 def test_worse_peers():
@@ -175,11 +217,10 @@ def test_worse_peers():
 
 
 def test_regression_command(tmp_path, monkeypatch, capsys):
-    """Against the last kept result of the same kind; status 1 where something is worse, 2 lines; one line for what cannot be compared."""
+    """Against the last kept result of the same kind; status 1 where something is worse; one line for what cannot be compared."""
     monkeypatch.setattr(report, "RESULTS", tmp_path)
-    row = {"case": "box", "law": "default", "metric": "x", "unit": "m", "h": [1e-2], "total": [1e-2]}
     new = tmp_path / "2026-02-01-accuracy-cpu.json"
-    new.write_text(json.dumps({"what": "accuracy", "rows": [row | {"total": [2e-2]}]}))
+    new.write_text(json.dumps({"what": "accuracy"} | kept_accuracy(total=[2e-2, 1e-3])))
 
     def run(*words: str) -> object:
         monkeypatch.setattr(sys, "argv", ["benchmarks", "regression", *words])
@@ -188,14 +229,15 @@ def test_regression_command(tmp_path, monkeypatch, capsys):
         return left.value.code
 
     assert "no result of this kind" in run(str(new))
-    (tmp_path / "2026-01-01-accuracy-cpu.json").write_text(json.dumps({"what": "accuracy", "rows": [row]}))
+    (tmp_path / "2026-01-01-accuracy-cpu.json").write_text(json.dumps({"what": "accuracy"} | kept_accuracy()))
+    (tmp_path / "2026-03-01-accuracy-cpu.json").write_text("{}")  # a later one is not what was before
     (tmp_path / "2026-01-09-stability-cpu.json").write_text(json.dumps({"what": "stability", "rows": []}))
     assert run(str(new)) == 1
     assert "1 worse than in" in capsys.readouterr().out
     assert run(str(new), str(new)) == 0
     assert "compare the same" in run(str(new), str(tmp_path / "2026-01-09-stability-cpu.json"))
-    (tmp_path / "x-y-z-accuracy-cpu.json").write_text("{")
-    assert "cannot be read" in run(str(tmp_path / "x-y-z-accuracy-cpu.json"), str(new))
+    assert "is no result of" in run(str(tmp_path / "2026-03-01-accuracy-cpu.json"), str(new))
+    assert "is not called" in run(str(tmp_path / "result.json"))
 
 
 # ----------------------------------------------------------------------------------------------------------------- command and documents
@@ -221,6 +263,21 @@ def test_quick_commands(tmp_path, monkeypatch, capsys):
     assert documents == {path: path.read_bytes() for path in (ROOT / "docs").glob("*")}
 
 
+def test_a_part_does_not_stand_beside_whole_results(tmp_path, monkeypatch):
+    """Neither its JSON nor its documents; where it should go is asked for by name."""
+    monkeypatch.setattr(report, "PARTIAL", tmp_path / "parts")
+    monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(report, "DOCS", tmp_path / "docs")
+    for words in (["accuracy", "--cases", "spin"], ["stability", "--cases", "spin", "--variants", "default", "--envs", "4"]):
+        monkeypatch.setattr(sys, "argv", ["benchmarks", *words])
+        monkeypatch.setattr(accuracy, "STEPS", (1e-2, 5e-3))
+        monkeypatch.setattr(stability, "STEPS", (1e-2,))
+        command.main()
+        assert len(list((tmp_path / "parts").glob(f"*-{words[0]}-*.json"))) == 1
+    assert not (tmp_path / "results").exists()
+    assert not (tmp_path / "docs").exists()
+
+
 def test_chart_of_no_data(tmp_path, monkeypatch):
     (tmp_path / "x.json").write_text("{}")
     monkeypatch.setattr(sys, "argv", ["benchmarks", "chart", "--data", str(tmp_path / "x.json")])
@@ -233,23 +290,8 @@ def last(what: str) -> dict:
     return json.loads(sorted((ROOT / "benchmarks" / "results").glob(f"*-{what}-cpu.json"))[-1].read_text())
 
 
-@pytest.mark.parametrize("what", ["accuracy", "chart", "stability"])
-def test_documents_hold_the_tables_of_the_results(what):
-    from benchmarks import stability
-
-    data = last(what)
-    made = {
-        "accuracy": lambda: accuracy.markdown(data["rows"]),
-        "chart": lambda: chart.markdown(data["rows"]),
-        "stability": lambda: stability.markdown(data["rows"], data["crowds"]),
-    }[what]()
-    assert report.tables(what, ROOT / "docs" / f"{what}.md") == made
-
-
-def test_picture_in_docs_is_of_the_results(tmp_path):
-    pytest.importorskip("matplotlib")
-    chart_picture.draw(last("chart")["rows"], tmp_path / "chart")
-    assert len((ROOT / "docs" / "chart.svg").read_text().split("<title>")) == len((tmp_path / "chart.svg").read_text().split("<title>"))
+def test_the_document_holds_the_tables_of_the_results():
+    assert report.tables("accuracy", ROOT / "docs" / "accuracy.md") == accuracy.markdown(last("accuracy")["rows"])
 
 
 def test_cases_that_are_taken_without_being_named():

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..motion import Motion
 from ..scenes import GRAVITY, GROUND, WORLD, Scene, Shape, ball_inertia, box_inertia, boxes
-from .case import Case, Metric, about_z, constant, heading, lift, linear, steps, tilted
+from .case import Case, Metric, about_z, constant, heading, lift, linear, moved_by, steps, tilted
 
 BOX_DURATION = 0.8  # s; the continuous motion rests at 0.661 s
 
@@ -60,13 +60,21 @@ def last_heading(moved: Motion) -> np.ndarray:
 
 NO_LIFT = Metric("lift", "m", lift, 0.0, constant(1e-6))
 
+
+def law_bar(h: float) -> float:
+    """In m, and in rad."""
+    return 0.1 * h if h > 1e-3 else 5e-5
+
+
 BOX = Case(
     "box",
     "the paper's box slides, turns and stops",
     partial(one_box, "box", (0.5, 0.5, 0.5), 1.0, (0, 5, 0, 0, 0, 2 * np.pi), 1.0, BOX_DURATION),
     (
-        Metric("rest position", "m", end, Lazy(box_reference, 0, 1), linear(0.1, 5e-5), model=True),
-        Metric("rest angle", "rad", last_heading, Lazy(box_reference, 2), linear(0.1, 1e-4), model=True),
+        # Euler's position is off by h v / 2 and a little more, as the box turns; of the law's share notes on the paper ask for 1 mm
+        # at 10 ms and 0.05 mm at 1 ms.
+        Metric("rest position", "m", end, Lazy(box_reference, 0, 1), linear(3.0), law_bar),
+        Metric("rest angle", "rad", last_heading, Lazy(box_reference, 2), linear(0.51 * 2 * np.pi), law_bar),
         NO_LIFT,
     ),
     "planar ODE of the box on four equally compliant corners, exact isotropic friction",
@@ -180,7 +188,7 @@ INCLINE_STICK = Case(
     "incline_stick",
     "a block on a slope 0.1 degrees below the friction angle, 10 s",
     partial(slope, -0.1, 10.0),
-    (Metric("creep", "m/s", slope_creep, 0.0, constant(1e-9)),),
+    (Metric("moved", "m", moved_by, 0.0, constant(1e-6)), Metric("creep", "m/s", slope_creep, 0.0, constant(1e-9))),
     "it rests",
     fails="convex and position-based laws creep; memory of the bristles lost",
     charted=True,
@@ -201,7 +209,7 @@ INCLINE_SLIDE = Case(
     "incline_slide",
     "a block on a slope 0.1 degrees above the friction angle, 2 s",
     partial(slope, 0.1, 2.0),
-    # Relative 1e-6; what the bristles of the first step take is of the same size.
+    # Relative 1e-6. Bristles of Table 1 need 1 ms to load, which shorter steps resolve: docs/accuracy.md.
     (Metric("velocity", "m/s", last_velocity, SLIDE_SPEED * DOWN, constant(1e-6 * SLIDE_SPEED)),),
     "g (sin - mu cos) t, downhill",
     fails="facets: it sticks or veers off",

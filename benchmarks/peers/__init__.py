@@ -79,8 +79,8 @@ class Peer(Other):
             object.__setattr__(self, "adapter", Path(__file__).parent / "adapters" / f"on_{self.name}.py")
 
 
-# MuJoCo's default contact is a spring with a time constant of 20 ms; the stiffest that it allows has two steps.
-STIFF = "0.002 1"
+#: MuJoCo's default contact is a spring with a time constant of 20 ms; the stiffest that it allows has two steps.
+STIFF = {"time_constant_steps": 2}
 # Drake's contacts are springs of 1e6 N/m, or 1e7 Pa where boxes meet. This is how far [m] a box may sink under the weight of all;
 # a fifth of it, and "lagged" throws the paper's box up.
 SAG = 5e-6
@@ -97,8 +97,8 @@ PEERS = {
                 "pyramidal": {"cone": "pyramidal"},
                 "elliptic": {"cone": "elliptic"},
                 "elliptic, noslip": {"cone": "elliptic", "noslip_iterations": 10},
-                "elliptic, stiff": {"cone": "elliptic", "solref": STIFF},
-                "elliptic, stiff, noslip": {"cone": "elliptic", "solref": STIFF, "noslip_iterations": 10},
+                "elliptic, stiff": {"cone": "elliptic"} | STIFF,
+                "elliptic, stiff, noslip": {"cone": "elliptic", **STIFF, "noslip_iterations": 10},
             },
         ),
         Peer(
@@ -108,7 +108,7 @@ PEERS = {
             {
                 "pyramidal": {"cone": "pyramidal"},
                 "elliptic": {"cone": "elliptic"},
-                "elliptic, stiff": {"cone": "elliptic", "solref": STIFF},
+                "elliptic, stiff": {"cone": "elliptic"} | STIFF,
             },
         ),
         Peer(

@@ -35,6 +35,7 @@ class Task:
         pose, velocity: [T, E, B, 7], [T, E, B, 6] at the start and after every `every` steps.
         before_pose, before_velocity: [T - 1, E, B, ..] one step before each of the later samples.
         contacts: mean number in an environment and a step.
+        recorded_s: what the run took that was recorded [s].
         info: of the last run: what the engine allocated, and whether that was enough ('overflow').
         same: whether all timed runs ended where the first one did.
     """
@@ -47,6 +48,7 @@ class Task:
     before_pose: np.ndarray
     before_velocity: np.ndarray
     contacts: float
+    recorded_s: float
     info: dict[str, Any]
     same: bool = True
     seconds: list[float] = field(default_factory=list)
@@ -117,7 +119,7 @@ class Session:
         reply = self.order({"do": "make", "id": index, "job": job}, variant)
         with np.load(result) as arrays:
             states = {name: arrays[name] for name in ("pose", "velocity", "before_pose", "before_velocity")}
-            task = Task(self, variant, index, **states, contacts=float(arrays["contacts"]), info=reply["info"])
+            task = Task(self, variant, index, **states, contacts=float(arrays["contacts"]), recorded_s=reply["seconds"], info=reply["info"])
         result.unlink()
         state.unlink()
         return task

@@ -16,10 +16,15 @@ def numbers(values: np.ndarray) -> str:
 
 
 def model(job: Job) -> str:
-    """MJCF of one environment. Settings: those of OPTIONS, and solref of every contact (absent: MuJoCo's default)."""
+    """MJCF of one environment.
+
+    Settings: those of OPTIONS, and time_constant_steps, the time constant of every contact in steps (absent: 20 ms).
+    """
     if job.restitution:
         raise Refused("MuJoCo has no coefficient of restitution")
-    surface = f'condim="3" friction="{job.friction} 0.005 0.0001"' + (f' solref="{s}"' if (s := job.settings.get("solref")) else "")
+    surface = f'condim="3" friction="{job.friction} 0.005 0.0001"' + (
+        f' solref="{s * job.dt} 1"' if (s := job.settings.get("time_constant_steps")) else ""
+    )
     geoms: dict[int, str] = dict.fromkeys(range(-1, len(job.mass)), "")
     for kind, body, size, pose in zip(job.shape_kind, job.shape_body, job.shape_size, job.shape_pose, strict=True):
         extent = {"plane": "0 0 1", "box": numbers(size), "sphere": numbers(size[:1]), "capsule": numbers(size[:2])}[kind]

@@ -12,8 +12,7 @@ import protocol
 import warp as wp
 
 GENEROUS = 16  # contacts for each body in the run that finds how many are needed
-GAP = 0.005  # m, of each shape; two of them are more than what a scene's bodies move in a step, unless they are fast
-LOOK_AHEAD = 1.5  # times the way of the fastest body in a step, where that is more
+GAP = 0.005  # m, of each shape; or what the fastest body moves in a step, where that is more (Newton's own default is 0.1 m)
 
 
 class NewtonEngine(protocol.Engine):
@@ -43,11 +42,10 @@ class NewtonEngine(protocol.Engine):
     def build(self) -> newton.Model:
         """All environments, one world each; colliders of the world belong to every one of them."""
         job = self.job
-        way = float(np.linalg.norm(job.velocity[..., :3], axis=-1).max(initial=0.0)) * job.dt
+        fall = np.linalg.norm(job.gravity) * min(job.steps * job.dt, float(np.sqrt(2.0 * max(job.pose[..., 2].max(), 0.0) / 9.81)))
+        way = (float(np.linalg.norm(job.velocity[..., :3], axis=-1).max(initial=0.0)) + fall) * job.dt
         # Coulomb friction alone: no rolling or torsional friction, which the other engines do not have in these scenes.
-        surface = newton.ModelBuilder.ShapeConfig(
-            density=0.0, mu=job.friction, mu_torsional=0.0, mu_rolling=0.0, gap=max(GAP, LOOK_AHEAD * way)
-        )
+        surface = newton.ModelBuilder.ShapeConfig(density=0.0, mu=job.friction, mu_torsional=0.0, mu_rolling=0.0, gap=max(GAP, way))
         gravity = tuple(job.gravity.tolist())
         world = newton.ModelBuilder(gravity=gravity)
         self.register(world)

@@ -4,11 +4,11 @@
 Orders, each with the "id" of a job that the caller chooses:
 
     {"do": "make", "id", "job": {scene, dt, steps, every, friction, restitution, settings, state, result}}
-        Build the engine and run the job once, not timed. `state` is the .npz that benchmarks.scenes.Scene.save writes. The
-        reply is {info}; the .npz `result` holds pose [T, E, B, 7] (x y z qx qy qz qw) and velocity [T, E, B, 6] (linear of the
-        centre of mass, then angular; world axes) at the start and after every `every` steps, as the engine gives them back,
-        before_pose and before_velocity [T - 1, E, B, ..], one step before each of the later samples, and contacts, their mean
-        number in an environment and a step.
+        Build the engine and run the job once, with everything recorded. `state` is the .npz that benchmarks.scenes.Scene.save
+        writes. The reply is {info, seconds: of the run}; the .npz `result` holds pose [T, E, B, 7] (x y z qx qy qz qw) and velocity
+        [T, E, B, 6] (linear of the centre of mass, then angular; world axes) at the start and after every `every` steps, as the
+        engine gives them back, before_pose and before_velocity [T - 1, E, B, ..], one step before each of the later samples, and
+        contacts, their mean number in an environment and a step.
     {"do": "run", "id"}
         All steps from the start, timed. The reply is {seconds, same, info}: same says whether it ended where the first run did.
     {"do": "drop", "id"}
@@ -139,11 +139,12 @@ def read(order: dict[str, Any]) -> Job:
 def make(order: dict[str, Any], build: Callable[[Job], Engine]) -> tuple[Engine, np.ndarray, dict[str, Any]]:
     """The engine after its untimed run, the last pose of that, and the reply."""
     engine = build(read(order))
+    begin = time.perf_counter()
     result = engine.record()
-    info = engine.info()
+    seconds, info = time.perf_counter() - begin, engine.info()
     engine.settle()
     np.savez(order["job"]["result"], **result)
-    return engine, result["pose"][-1], {"info": info}
+    return engine, result["pose"][-1], {"info": info, "seconds": seconds}
 
 
 def timed(engine: Engine, last: np.ndarray) -> dict[str, Any]:
