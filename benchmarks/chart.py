@@ -37,7 +37,7 @@ ENVS = {"stack10": 8, "rolling": 8, "heap": 8}
 USUAL_ENVS = 64
 TIMED = 0.2  # s of simulated time that are timed
 TURNS, LEAST_TURN = 3, 0.05  # s: a turn repeats a short run for so long and keeps its median
-PATIENCE = 30.0  # s that a run from beginning to end may be expected to take
+PATIENCE = 20.0  # s that a run from beginning to end may be expected to take
 TURN = 4.0  # s that a timed turn is expected to take at most: slow engines get fewer environments, but no fewer than LEAST_ENVS
 LEAST_ENVS = 4
 #: Errors under this are round-off, and no better than it.

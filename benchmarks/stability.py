@@ -29,7 +29,7 @@ CERTIFIED = 0.999
 DRIFT = 10.0
 #: The energy, or a number, that nothing comes back from.
 BLOWN = 0.1
-LIMIT_S, QUICK_LIMIT_S = 20.0, 2.0  # of one run
+LIMIT_S, QUICK_LIMIT_S = 5.0, 1.0  # of one run
 VERDICTS = {
     "survived": "S",
     "drifted": "D",
