@@ -105,13 +105,14 @@ def count(name: str, sim: wl.Simulator, steps: int, start: Callable[[wl.Simulato
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """One line a scene."""
-    lines = ["| scene | formulation | env-steps | certified | not certified | NaN | residual p99 | p99.99 | worst [m/s] | us an env-step |"]
-    lines += ["|" + " --- |" * 10]
+    heads = ["scene", "formulation", "env-steps", "certified", "not certified", "NaN", "environments with one of these"]
+    heads += ["residual p99", "p99.99", "worst [m/s]", "us an env-step"]
+    lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
     for r in rows:
         total = r["envs"] * r["steps"]
         lines.append(
             f"| {r['scene']} | {r.get('formulation', 'default')} | {total:,} | {100 * r['certified']:.5f} % | {r['status']['UNCERTIFIED']} "
-            f"| {r['status']['NOT_A_NUMBER']} | {r['residual_p99']:.1e} | {r['residual_p9999']:.1e} | {r['residual_worst']:.1e} "
+            f"| {r['status']['NOT_A_NUMBER']} | {r['spoilt_envs']} of {r['envs']} | {r['residual_p99']:.1e} | {r['residual_p9999']:.1e} | {r['residual_worst']:.1e} "
             f"| {1e6 * r['seconds_per_env_step']:.2f} |"
         )
     return "\n".join(lines)
