@@ -109,10 +109,10 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     heads += ["residual p99", "p99.99", "worst [m/s]", "us an env-step"]
     lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
     for r in rows:
-        total = r["envs"] * r["steps"]
+        status, residuals = r["status"], " | ".join(f"{r[name]:.1e}" for name in ("residual_p99", "residual_p9999", "residual_worst"))
         lines.append(
-            f"| {r['scene']} | {r.get('formulation', 'default')} | {total:,} | {100 * r['certified']:.5f} % | {r['status']['UNCERTIFIED']} "
-            f"| {r['status']['NOT_A_NUMBER']} | {r['spoilt_envs']} of {r['envs']} | {r['residual_p99']:.1e} | {r['residual_p9999']:.1e} | {r['residual_worst']:.1e} "
+            f"| {r['scene']} | {r.get('formulation', 'default')} | {r['envs'] * r['steps']:,} | {100 * r['certified']:.5f} % "
+            f"| {status['UNCERTIFIED']} | {status['NOT_A_NUMBER']} | {r['spoilt_envs']} of {r['envs']} | {residuals} "
             f"| {1e6 * r['seconds_per_env_step']:.2f} |"
         )
     return "\n".join(lines)
