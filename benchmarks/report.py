@@ -27,6 +27,13 @@ def processor() -> str:
     return names[0] if names else platform.processor()
 
 
+def plain(value: Any) -> Any:
+    """A numpy scalar as Python's own."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} has no place in a result")
+
+
 def path_of(folder: Path, what: str, device: wp.Device) -> Path:
     """folder/<date>-<what>-<device>.json"""
     return folder / f"{STAMP}-{what}-{'cuda' if device.is_cuda else 'cpu'}.json"
@@ -46,7 +53,7 @@ def write(folder: Path, what: str, device: wp.Device, data: dict[str, Any]) -> P
     }
     folder.mkdir(parents=True, exist_ok=True)
     path = path_of(folder, what, device)
-    path.write_text(json.dumps(header | data, indent=1) + "\n")
+    path.write_text(json.dumps(header | data, indent=1, default=plain) + "\n")
     return path
 
 

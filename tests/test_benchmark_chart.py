@@ -247,7 +247,7 @@ def test_quick_commands(tmp_path, monkeypatch, capsys):
     """Run, write their JSON, leave the documents alone."""
     documents = {path: path.read_bytes() for path in (ROOT / "docs").glob("*")}
     for words in (
-        ["accuracy", "--cases", "spin"],
+        ["accuracy", "--cases", "spin,press_drop"],
         ["stability", "--cases", "spin", "--variants", "default; AP, k = 2", "--envs", "8"],
         ["chart", "--cases", "slip_to_roll"],
     ):
