@@ -35,10 +35,10 @@ QUICK_STEPS = (1e-2, 2e-3)
 #: Environments that are timed together, where a case is not slow.
 ENVS = {"stack10": 8, "rolling": 8, "heap": 8}
 USUAL_ENVS = 64
-TIMED = 0.2  # s of simulated time that are timed
+TIMED, LEAST_STEPS, MOST_STEPS = 0.2, 20, 400  # s of simulated time that are timed, within these numbers of steps
 TURNS, LEAST_TURN = 3, 0.05  # s: a turn repeats a short run for so long and keeps its median
 PATIENCE = 20.0  # s that a run from beginning to end may be expected to take
-TURN = 4.0  # s that a timed turn is expected to take at most: slow engines get fewer environments, but no fewer than LEAST_ENVS
+TURN = 2.0  # s that a timed turn is expected to take at most: slow engines get fewer environments, but no fewer than LEAST_ENVS
 LEAST_ENVS = 4
 #: Errors under this are round-off, and no better than it.
 ROUND_OFF = 1e-12
@@ -114,7 +114,7 @@ def part(case: Case, h: float, env_step: float = 0.0) -> Scene:
     """The batch that is timed, if a step of an environment takes about so many seconds."""
     pose, velocity = settled(case.name)
     scene = replace(case.scene(h), pose=pose, velocity=velocity)
-    number = max(20, round(TIMED / h))
+    number = min(max(LEAST_STEPS, round(TIMED / h)), MOST_STEPS)
     most = TURN / (env_step * number) if env_step else math.inf
     return replace(scene.copies(int(min(envs(case.name), max(LEAST_ENVS, most)))), steps=number)
 
