@@ -25,12 +25,16 @@ def test_default_survives_at_5_ms(name):
     assert moved.certified >= 0.999
 
 
+#: Where it does not: an impact spread over two steps takes too much, corners are found a step late (docs/accuracy.md).
+MISSED = {(1e-2, "rocking"), (1e-2, "heap")}
+OTHERS = [
+    pytest.param(h, name, marks=[pytest.mark.xfail(strict=True)] if (h, name) in MISSED else []) for h in (1e-3, 1e-2) for name in CASES
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("h", [1e-3, 1e-2])
-def test_default_survives_at_other_steps(name, h):
-    if h == 1e-2 and name in ("rocking", "heap"):
-        pytest.xfail("an impact spread over two steps takes too much; corners found a step late (docs/stability.md)")
+@pytest.mark.parametrize(("h", "name"), OTHERS)
+def test_default_survives_at_other_steps(h, name):
     known = CASES[name]
     moved = known.simulate(h)
     exact = known.simulate(h, formulation="coulomb") if any(metric.law_bar for metric in known.metrics) else None
