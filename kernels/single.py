@@ -120,6 +120,9 @@ def make(real, cone: bool, frozen: bool, rows: bool):
             total = spatial()
             flips = count
             solves = int(0)
+            # Where flips go round, once more with what still flips sticking: a contact that would pull if it slid, and sink in if it did
+            # not push, has no other way (Painleve's paradox).
+            once_more = limit - limit // 3
             while flips > 0 and solves < limit:
                 # Not kept from one solve to the next: registers are short.
                 vv = wp.diag(vec3(real(1.0) / bodies.inv_mass[env, body]))
@@ -193,6 +196,8 @@ def make(real, cone: bool, frozen: bool, rows: bool):
                     total += wrench(arm, side * (wp.transpose(frame) * p))
                     if again:
                         flips += 1
+                        if solves == once_more:
+                            after = CLOSED  # and neither axis slides
                         contacts.state[env, i] = after
                         if wp.static(cone):
                             contacts.slip[env, i] = turned
