@@ -120,9 +120,10 @@ def make(real, cone: bool, frozen: bool, rows: bool):
             total = spatial()
             flips = count
             solves = int(0)
-            # Where flips go round, once more with what still flips sticking: a contact that would pull if it slid, and sink in if it did
-            # not push, has no other way (Painleve's paradox).
-            once_more = limit - limit // 3
+            # Where the flips of a lone contact go round, it sticks: open it would sink in, sliding it would pull (Painleve's paradox).
+            once_more = int(0)
+            if count == 1:
+                once_more = limit - limit // 3
             while flips > 0 and solves < limit:
                 # Not kept from one solve to the next: registers are short.
                 vv = wp.diag(vec3(real(1.0) / bodies.inv_mass[env, body]))
