@@ -75,7 +75,7 @@ def measure(device: Any, names: list[str], quick: bool) -> list[dict[str, Any]]:
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:
-    """A line for each case, metric and law: errors at every step, their order, and the two parts at the largest and the smallest step."""
+    """Errors at every step of each case, metric and law, their order, the two parts at the first and last step; what the cases are."""
     steps = rows[0]["h"]
     heads = ["case", "metric", "law", *(f"{1e3 * h:g} ms" for h in steps), "order", "of the law", "of the step"]
     lines = ["| " + " | ".join(heads) + " |", "|" + " --- |" * len(heads)]
@@ -92,4 +92,7 @@ def markdown(rows: list[dict[str, Any]]) -> str:
         f"\nBold: over the bar ({outside} of {total}). Certified: at least {100 * low:.2f} % of the env-steps of every run. "
         f"Energy: never above its start by more than {rise:.0e} of it."
     )
+    lines += ["", "| case | what happens | what is known of it | known to fail |", "| --- | --- | --- | --- |"]
+    shown = (CASES[name] for name in dict.fromkeys(row["case"] for row in rows))
+    lines += [f"| {case.name} | {case.title} | {case.source} | {case.fails} |" for case in shown]
     return "\n".join(lines)

@@ -110,8 +110,3 @@ def steps(moved: Motion) -> list[Step]:
 def largest(moved: Motion) -> float:
     """Over the chosen steps [J]; NaN where a state is not a number."""
     return float(np.max([step.energy() for step in steps(moved)])) if moved.finite else float("nan")
-
-
-def of_a_fall(scene: Scene) -> float:
-    """Energy that gravity gives all bodies from rest in one step [J]: what E_uc is a share of, for comparison between steps."""
-    return float(0.5 * scene.mass.sum() * (np.linalg.norm(scene.gravity) * scene.dt) ** 2)

@@ -34,11 +34,17 @@ def test_painleve_rod_is_solved_in_every_step(name, law):
     assert moved.iterations.max() <= 12
 
 
-#: Where it does not: an impact spread over two steps takes too much, corners are found a step late (docs/accuracy.md).
-MISSED = {(1e-2, "rocking"), (1e-2, "heap")}
-OTHERS = [
-    pytest.param(h, name, marks=[pytest.mark.xfail(strict=True)] if (h, name) in MISSED else []) for h in (1e-3, 1e-2) for name in CASES
-]
+#: Where it does not, measured and told in docs/accuracy.md; strict: the day it survives the test fails, and the line goes.
+MISSED = {(1e-2, "rocking"): "an impact spread over two steps takes too much", (1e-2, "heap"): "corners are found a step late"}
+
+
+def other(h: float, name: str):
+    """A parameter, expected to fail where the default is known to miss a bar."""
+    why = MISSED.get((h, name))
+    return pytest.param(h, name, marks=[pytest.mark.xfail(strict=True, reason=why)] if why else [])
+
+
+OTHERS = [other(h, name) for h in (1e-3, 1e-2) for name in CASES]
 
 
 @pytest.mark.slow
@@ -244,6 +250,7 @@ def test_accuracy_tells_the_law_from_the_step():
     assert rows["midpoint"]["discretisation"][0] < 0.02 * rows["default"]["discretisation"][0]
     text = accuracy.markdown(list(rows.values()))
     assert "| spin | stop angle [rad] | default | 3.1e-02 | 3.1e-03 | 1.00 |" in text
+    assert f"| spin | {CASES['spin'].title} | {CASES['spin'].source} | {CASES['spin'].fails} |" in text
     assert "**" not in text
 
 
@@ -289,7 +296,6 @@ def test_energy_error_of_motions():
     assert crude > 1e-4
     scene = replace(known.scene(1e-2), pose=known.scene(1e-2).pose + np.array([0, 0, 50.0, 0, 0, 0, 0]))
     assert energy_error.largest(motion.simulate(scene, 1)) < 1e-20
-    assert energy_error.of_a_fall(scene) == pytest.approx(0.5 * (9.81 * 0.01) ** 2)
 
 
 def test_energy_error_sees_the_first_step():
