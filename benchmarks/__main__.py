@@ -18,6 +18,7 @@ from . import (
     friction,
     goals,
     lcp,
+    lcp_picture,
     needs,
     paper,
     paper_picture,
@@ -80,7 +81,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     sub.add_argument("--envs", type=int, default=None, help="randomised copies of each case (default 4096; with --quick 64)")
     sub = command("chart", run_chart, "speed against accuracy, beside other engines; pictures", out, quick, few, docs, device, place)
     sub.add_argument("--peers", type=peer_names, default=None, metavar="all|none|NAME,...", help="default: all; with --quick: none")
-    sub.add_argument("--data", type=Path, help="tell and draw these kept results, measure nothing")
+    sub.add_argument("--data", type=Path, nargs="+", metavar="FILE", help="tell and draw what is kept there; several: joined")
     sub = command(
         "speed", run_speed, "env-steps/s of the paper's box, start-up, mass ratios, fallback, floors, peers", out, quick, place, device
     )
@@ -91,7 +92,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     sub.add_argument("--problems", type=Path, default=friction.PROBLEMS, help="folder of .npz files with W, q, mu")
     sub.add_argument("--siconos", type=Path, default=Path("/usr/bin/python3"), help="Python that has Siconos (default: the system's)")
     sub.add_argument("--docs", type=Path, default=Path("docs"), help="folder of the picture (default: docs)")
-    sub = command("lcp", run_lcp, "every method for LCPs on recorded problems", out, quick)
+    sub = command("lcp", run_lcp, "every method for LCPs on recorded problems", out, quick, docs)
     sub.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
     sub = command("paper", run_paper, "the paper's own comparison: formulations, lead matrices, Fig. 4", quick)
     sub.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
@@ -169,25 +170,32 @@ def run_stability(asked: argparse.Namespace) -> None:
         stability_picture.draw(rows, folder / "stability")
 
 
+def chart_rows(path: Path) -> list[dict[str, Any]]:
+    """What a chart's result holds."""
+    try:
+        return json.loads(path.read_text())["rows"]
+    except (OSError, ValueError, KeyError) as error:
+        raise SystemExit(f"python -m benchmarks: error: {path} holds no data of a chart: {error}") from error
+
+
 def run_chart(asked: argparse.Namespace) -> None:
-    """Measured, unless data are given, kept after every case, told and drawn."""
-    complete = False
+    """Measured and kept after every case, unless data are given; told and drawn. Parts that are joined are kept as one."""
+    device = wp.get_device(asked.device)
     if asked.data:
-        try:
-            rows = json.loads(asked.data.read_text())["rows"]
-        except (OSError, ValueError, KeyError) as error:
-            raise SystemExit(f"python -m benchmarks: error: {asked.data} holds no data of a chart: {error}") from error
+        rows = [row for path in asked.data for row in chart_rows(path)]
+        complete = len(asked.data) > 1 and chart.complete(rows)
+        if len(asked.data) > 1:
+            keep(asked, device, {"rows": rows}, complete)
     else:
-        device = wp.get_device(asked.device)
         names = asked.peers if asked.peers is not None else [] if asked.quick or device.is_cuda else list(peers.PEERS)
         if names and device.is_cuda:
             raise SystemExit("python -m benchmarks: error: other engines run on the CPU: --peers none, or --device cpu")
         present, absent = peers.split(names, asked.dir)
         if absent:
             print(absent)
-        complete = asked.cases == chart.CHARTED and len(present) == len(peers.PEERS)
         for rows in chart.measure(asked.cases, present, asked.dir, device, asked.quick):
             report.write(asked.out or report.PARTIAL, asked.what, device, {"rows": rows})
+        complete = chart.complete(rows)
         keep(asked, device, {"rows": rows}, complete)
     print(chart.markdown(rows))
     if folder := documents(asked, complete):
@@ -253,6 +261,8 @@ def run_lcp(asked: argparse.Namespace) -> None:
         raise SystemExit(f"python -m benchmarks: error: {error}") from error
     print(lcp.markdown(rows))
     keep(asked, device, {"rows": rows})
+    if folder := documents(asked, True):
+        lcp_picture.draw(rows, folder / "lcp_profile")
 
 
 def run_paper(asked: argparse.Namespace) -> None:

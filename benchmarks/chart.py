@@ -26,7 +26,7 @@ from tqdm import tqdm
 from . import energy_error, motion, stability
 from .cases import CASES, Case
 from .motion import Motion
-from .peers import Peer, compare
+from .peers import PEERS, Peer, compare
 from .peers.session import PeerError, Refused, Session, Task, session
 from .scenes import Scene
 
@@ -257,6 +257,12 @@ def measure(names: list[str], peers: list[Peer], folder: Path, device: Any, quic
 
 
 # ------------------------------------------------------------------------------------------------------------------- reports
+
+
+def complete(rows: list[dict[str, Any]]) -> bool:
+    """Is every charted case there, at every step and with every engine?"""
+    seen = {(row["case"], row["engine"], row["h"]) for row in rows}
+    return seen >= {(case, engine, h) for case in CHARTED for engine in ("warp_lcp", *PEERS) for h in STEPS}
 
 
 def counts(row: dict[str, Any]) -> bool:

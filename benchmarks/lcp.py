@@ -7,6 +7,7 @@ method says is judged here again with numpy, in extended precision where the mac
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from pathlib import Path
@@ -66,6 +67,7 @@ def one(device: wp.Device, path: Path, method: str, precision: str, repetitions:
         "problems": len(q),
         "known_to_be_solvable": int(np.count_nonzero(known <= TOLERANCE["float64"])),
         "solved": int(np.count_nonzero(ok)),
+        "right": (ok & (found <= tolerance)).tolist(),
         "worst_residual_of_solved": float(found[ok].max(initial=0.0)),
         "wrong_ok": int(np.count_nonzero(ok & ~(found <= tolerance))),
         "missed_ok": int(np.count_nonzero(~ok & (found <= tolerance))),
@@ -80,6 +82,16 @@ def measure(device: wp.Device, folder: Path, quick: bool) -> list[dict[str, Any]
     """Every file, method and precision."""
     cases = [(path, m, p) for p in TOLERANCE for path in problems(folder) for m in METHODS]
     return [one(device, *case, 1 if quick else 7) for case in tqdm(cases, desc="lcp", disable=None)]
+
+
+def times(rows: list[dict[str, Any]], precision: str) -> dict[str, list[float]]:
+    """Seconds of every method on every problem: its batch's over their number; infinity where it did not solve it."""
+    table: dict[str, list[float]] = {}
+    for row in rows:
+        if row["precision"] == precision:
+            seconds = row["seconds_per_problem"]
+            table.setdefault(row["method"], []).extend(seconds if right else math.inf for right in row["right"])
+    return table
 
 
 def markdown(rows: list[dict[str, Any]]) -> str:

@@ -285,6 +285,29 @@ def test_chart_of_no_data(tmp_path, monkeypatch):
         command.main()
 
 
+def test_parts_of_a_chart_are_joined(tmp_path, monkeypatch, capsys):
+    """They become a whole result where every case, step and engine is there, and a part beside it where not."""
+    monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(report, "PARTIAL", tmp_path / "parts")
+    monkeypatch.setattr(chart_picture, "draw", lambda *_: [])
+    engines = ("warp_lcp", *peers.PEERS)
+    rows = [point(engine, h=h, case=case, versions={}) for case in chart.CHARTED for engine in engines for h in chart.STEPS]
+    assert chart.complete(rows)
+    assert not chart.complete([row for row in rows if row["engine"] != "drake"])
+
+    def join(first: list[dict], second: list[dict]) -> list[dict]:
+        files = [tmp_path / "a.json", tmp_path / "b.json"]
+        for file, part in zip(files, (first, second), strict=True):
+            file.write_text(json.dumps({"rows": part}))
+        monkeypatch.setattr(sys, "argv", ["benchmarks", "chart", "--data", *map(str, files), "--docs", str(tmp_path / "docs")])
+        command.main()
+        (kept,) = (tmp_path / ("results" if len(first + second) == len(rows) else "parts")).glob("*-chart-cpu.json")
+        return json.loads(kept.read_text())["rows"]
+
+    assert join(rows[:5], rows[5:]) == rows
+    assert join(rows[:5], rows[9:]) == rows[:5] + rows[9:]
+
+
 def last(what: str) -> dict:
     """The result that is kept."""
     return json.loads(sorted((ROOT / "benchmarks" / "results").glob(f"*-{what}-cpu.json"))[-1].read_text())

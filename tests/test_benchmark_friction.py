@@ -167,11 +167,6 @@ def test_table_names_the_best():
     assert "| 1 us PROX dense | 2 us NSGS dense |" in text
 
 
-def test_profile():
-    ratios = summary.profile({"a": [1.0, 4.0, math.inf, math.inf], "b": [2.0, 2.0, 3.0, math.inf]})
-    assert ratios == {"a": [1.0, 2.0], "b": [1.0, 1.0, 2.0]}
-
-
 def test_picture(tmp_path):
     rows = [row(5.0, 1.0, [entry(2.0), entry(9.0, 1e-8, "PROX")], Pinocchio=[entry(2.5, solver="PGS")]), row(5.0, 4.0, [entry(3.0)])]
     pytest.importorskip("matplotlib")

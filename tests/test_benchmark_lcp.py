@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The LCP benchmark counts what it says it counts, and trusts no status."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import warp as wp
 from conftest import DEVICE
 
 import warp_lcp as wl
-from benchmarks import lcp
+from benchmarks import lcp, lcp_picture, profiles
 
 
 @pytest.fixture
@@ -45,3 +46,23 @@ def test_a_wrong_ok_is_counted(folder, monkeypatch):
 def test_an_absent_folder_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=f"{tmp_path.name}/absent: no .npz files"):
         lcp.problems(tmp_path / "absent")
+
+
+def test_profile():
+    ratios = profiles.profile({"a": [1.0, 4.0, math.inf, math.inf], "b": [2.0, 2.0, 3.0, math.inf]})
+    assert ratios == {"a": [1.0, 2.0], "b": [1.0, 1.0, 2.0]}
+
+
+def test_times_are_those_of_problems_solved():
+    """A batch's time over its number for every problem that was solved, infinity for those that were not."""
+    row = {"precision": "float64", "problem": "a", "seconds_per_problem": 2.0, "right": [True, False, True]}
+    other = row | {"method": "murty", "seconds_per_problem": 1.0, "right": [False, False, True]}
+    rows = [row | {"method": "lemke"}, other, row | {"method": "lemke", "precision": "float32"}]
+    assert lcp.times(rows, "float64") == {"lemke": [2.0, math.inf, 2.0], "murty": [math.inf, math.inf, 1.0]}
+
+
+def test_picture(folder, tmp_path):
+    pytest.importorskip("matplotlib")
+    png, svg = lcp_picture.draw(lcp.measure(wp.get_device(DEVICE), folder, quick=True), tmp_path / "drawn" / "lcp_profile")
+    assert png.read_bytes()[:4] == b"\x89PNG"
+    assert all(method in svg.read_text() for method in lcp.METHODS)

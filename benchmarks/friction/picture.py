@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..pictures import pyplot, save
+from ..profiles import panel, profile
 from . import summary
 
 #: Line style, marker, width, shade of each curve in order: of ours, and of a rival's.
@@ -22,31 +23,6 @@ THEIRS = (
 )
 
 
-def panel(axis: Any, profiles: dict[str, list[float]], number: int, limit: float) -> None:
-    """Some of the solvers of one tolerance; number: of problems."""
-    ours = [solver for solver in profiles if solver.startswith("warp_lcp")]
-    styles = dict(zip(ours, OURS, strict=True)) | dict(zip([s for s in profiles if s not in ours], THEIRS, strict=False))
-    for place, (solver, ratios) in enumerate(profiles.items()):
-        line, marker, width, shade = styles[solver]
-        shares = [(i + 1) / number for i in range(len(ratios))]
-        axis.step(
-            [1.0, *ratios, limit],
-            [0.0, *shares, shares[-1] if shares else 0.0],
-            where="post",
-            linestyle=line,
-            linewidth=width,
-            color=shade,
-            marker=marker,
-            markersize=6,
-            markerfacecolor="white" if place % 2 else shade,
-            markevery=(1 + place % 3, 4),
-            label=solver,
-        )
-    axis.set(xscale="log", xlim=(1.0, limit), ylim=(0.0, 1.03))
-    axis.grid(True, which="major", color="0.88", linewidth=0.6)
-    axis.spines[["top", "right"]].set_visible(False)
-
-
 def draw(rows: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
     """Write friction_profile.png and .svg into a folder; a row of panels for each rival beside ours, a column for each tolerance.
 
@@ -56,18 +32,18 @@ def draw(rows: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
     names = summary.rivals(rows)
     size = (len(names), len(summary.TOLERANCES))
     figure, axes = plt.subplots(*size, figsize=(10.0, 4.2 * len(names)), sharex=True, sharey=True, squeeze=False, layout="constrained")
-    profiles = [summary.profile(summary.times(rows, tolerance)) for tolerance in summary.TOLERANCES]
+    profiles = [profile(summary.times(rows, tolerance)) for tolerance in summary.TOLERANCES]
     limit = 3.0 * max(ratios[-1] for found in profiles for ratios in found.values() if ratios)
     for line, name in zip(axes, names, strict=True):
         for axis, found in zip(line, profiles, strict=True):
             shown = {solver: ratios for solver, ratios in found.items() if solver.startswith(("warp_lcp", name))}
-            panel(axis, shown, len(rows), limit)
+            mine = [solver for solver in shown if solver.startswith("warp_lcp")]
+            styles = dict(zip(mine, OURS, strict=True)) | dict(zip([s for s in shown if s not in mine], THEIRS, strict=False))
+            panel(axis, shown, len(rows), limit, styles)
         line[0].set_ylabel(f"share of {len(rows)} problems solved")
         line[-1].legend(loc="center left", bbox_to_anchor=(1.02, 0.5), frameon=False, handlelength=4.5)
     for axis, tolerance in zip(axes[0], summary.TOLERANCES, strict=True):
         axis.set_title(f"natural map $\\leq$ $10^{{{round(math.log10(tolerance))}}}$")
-    for axis in axes[-1]:
-        axis.set_xlabel("time / time of the fastest solver")
     folder.mkdir(parents=True, exist_ok=True)
     paths = save(figure, folder / "friction_profile")
     plt.close(figure)

@@ -96,18 +96,6 @@ def times(rows: Sequence[dict[str, Any]], tolerance: float) -> dict[str, list[fl
     return table
 
 
-def profile(table: dict[str, list[float]]) -> dict[str, list[float]]:
-    """Ratios to the fastest solver of each problem, ascending, only those of problems solved (Dolan and More 2002).
-
-    A problem that nobody solves counts for nobody: the share of solved problems is len(ratios) / number of problems.
-    """
-    fastest = [min(column) for column in zip(*table.values(), strict=True)]
-    return {
-        solver: sorted(own / least for own, least in zip(column, fastest, strict=True) if math.isfinite(own))
-        for solver, column in table.items()
-    }
-
-
 def unit(value: float) -> str:
     """Time in us or ms with three digits."""
     return f"{1e6 * value:.3g} us" if value < 1e-3 else f"{1e3 * value:.3g} ms"
