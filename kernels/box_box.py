@@ -9,8 +9,9 @@ import warp as wp
 from .collide import NO_POINT, pair_functions
 from .types import OPTIONS, scalar_types
 
-# Of the smallest half extent: boxes that overlap by no more along an axis count as touching, which is how soft ones rest.
-TOUCHING = wp.constant(0.1)
+# Of the smallest half extent: boxes that overlap by no more along an axis count as touching, which is how soft ones rest; those that
+# graze an edge, too, and end so deep in its side.
+TOUCHING = wp.constant(0.03)
 
 
 @functools.cache

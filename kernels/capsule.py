@@ -170,6 +170,7 @@ def make(real) -> dict:
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f, g = pair_functions(real), segment_functions(real)
     shape_pose, reach, set_apart, shape_velocity = f.shape_pose, f.reach, f.set_apart, f.shape_velocity
+    shape_turn, rotation, shift = f.shape_turn, f.rotation, f.shift
     write, write_bent = f.write, f.write_bent
     outside_box, bend, whole, cut, direction, perpendicular = f.outside_box, f.bend, g.whole, g.cut, g.direction, g.perpendicular
     outside_segment, nearest_to_box, nearest_to_segment = g.outside_segment, g.nearest_to_box, g.nearest_to_segment
@@ -177,11 +178,13 @@ def make(real) -> dict:
 
     @wp.struct
     class Motion:
-        """Motion of a capsule relative to the other shape over a step at present velocities, world axes, and where it leads."""
+        """Motion of a capsule b and another shape a over a step at present velocities, world axes, and where it leads."""
 
-        middle: vec3  # of the segment, now
-        shift: vec3  # h u of that point, m
-        turn: vec3  # h w, rad
+        com_a: vec3
+        com_b: vec3
+        shift: vec3  # of com_b relative to com_a, m
+        turn_a: vec3  # rad
+        turn_b: vec3
         distance: real  # of the segment from the other shape, then
         normal: vec3  # to the segment, then; of that length
         near: real  # what is further away than this gets no row
@@ -191,16 +194,19 @@ def make(real) -> dict:
         return wp.transform_vector(pose, vec3(real(0.0), real(0.0), real(1.0)))
 
     @wp.func
-    def relative_motion(topology: Topology, bodies: Bodies, env: int, a: int, b: int, middle: vec3, h: real) -> Motion:
-        """Motion of shape b relative to shape a; where it leads is left open."""
+    def relative_motion(topology: Topology, bodies: Bodies, env: int, a: int, b: int, h: real) -> Motion:
+        """Where it leads is left open."""
         motion = Motion()
-        motion.middle = middle
-        motion.shift = h * shape_velocity(topology, bodies, bodies.velocity, env, b, middle)
-        motion.shift -= h * shape_velocity(topology, bodies, bodies.velocity, env, a, middle)
-        if topology.shape_body[b] >= 0:
-            motion.turn += h * wp.spatial_bottom(bodies.velocity[env, topology.shape_body[b]])
-        if topology.shape_body[a] >= 0:
-            motion.turn -= h * wp.spatial_bottom(bodies.velocity[env, topology.shape_body[a]])
+        motion.turn_a = shape_turn(topology, bodies, env, a, h)
+        motion.turn_b = shape_turn(topology, bodies, env, b, h)
+        body_a = topology.shape_body[a]
+        body_b = topology.shape_body[b]
+        if body_a >= 0:
+            motion.com_a = bodies.com[env, body_a]
+            motion.shift -= h * wp.spatial_top(bodies.velocity[env, body_a])
+        if body_b >= 0:
+            motion.com_b = bodies.com[env, body_b]
+            motion.shift += h * wp.spatial_top(bodies.velocity[env, body_b])
         return motion
 
     @wp.func
@@ -210,9 +216,14 @@ def make(real) -> dict:
         """A point of the segment, p in the world, at a distance along n from the other shape; radii: of both together."""
         gap = distance - radii
         if gap < motion.near:
-            closing = motion.shift + wp.cross(motion.turn, p - motion.middle)
-            b = bend(distance, n, closing, motion.distance, motion.normal)
-            write_bent(slots, env, slot, p - n * (radius + real(0.5) * gap), n, gap, b, feature)
+            carried = wp.cross(motion.turn_b, p - motion.com_b)
+            along = motion.shift + carried  # of p relative to com_a
+            around = wp.cross(motion.turn_a, p - motion.com_a)
+            left = bend(distance, n, along - around, motion.distance, motion.normal)
+            # Not another point of the segment that comes nearer, which has a row of its own: what turning takes from this one.
+            curl = wp.cross(motion.turn_b, carried) - real(2.0) * wp.cross(motion.turn_a, along) + wp.cross(motion.turn_a, around)
+            left = wp.max(left, wp.min(real(0.5) * wp.dot(n, curl), real(0.0)))
+            write_bent(slots, env, slot, p - n * (radius + real(0.5) * gap), n, gap, left, feature)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def plane_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
@@ -248,9 +259,10 @@ def make(real) -> dict:
             n = direction(out, distance, real(MEETS) * rb, perpendicular(axis))  # from the capsule to the sphere
             gap = distance - ra - rb
             u = shape_velocity(topology, bodies, bodies.velocity, env, sa, centre)
-            u -= shape_velocity(topology, bodies, bodies.velocity, env, sb, centre)
-            ahead = outside_segment(p + h * u, axis, half)
-            b = bend(distance, n, h * u, wp.length(ahead), ahead)
+            closing = h * (u - shape_velocity(topology, bodies, bodies.velocity, env, sb, centre))
+            move = shift(topology, bodies, env, sa, centre, h) - shift(topology, bodies, env, sb, centre - p, h)
+            ahead = outside_segment(p + move, wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), axis), half)
+            b = bend(distance, n, closing, wp.length(ahead), ahead)
             write_bent(slots, env, topology.pair_slots[pair], centre - n * (ra + real(0.5) * gap), -n, gap, b, 0)
 
     @wp.func
@@ -395,13 +407,16 @@ def make(real) -> dict:
                 c = wp.transform_point(wp.transform_inverse(box), middle)
                 e = wp.quat_rotate_inv(turn, axis)
                 if wp.length(outside_box(c + e * nearest_to_box(c, e, half, size), size)) > real(MEETS) * r:
-                    motion = relative_motion(topology, bodies, env, sa, sb, middle, h)
+                    motion = relative_motion(topology, bodies, env, sa, sb, h)
                     motion.near = near
-                    ahead = c + wp.quat_rotate_inv(turn, motion.shift)
-                    e_ahead = wp.normalize(e + wp.quat_rotate_inv(turn, wp.cross(motion.turn, axis)))
+                    move = shift(topology, bodies, env, sb, middle, h) - shift(topology, bodies, env, sa, centre, h)
+                    further = rotation(wp.quat_rotate_inv(turn, shape_turn(topology, bodies, env, sa, h)))
+                    ahead = wp.quat_rotate_inv(further, c + wp.quat_rotate_inv(turn, move))
+                    e_ahead = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), axis)
+                    e_ahead = wp.quat_rotate_inv(further, wp.quat_rotate_inv(turn, e_ahead))
                     out = outside_box(ahead + e_ahead * nearest_to_box(ahead, e_ahead, half, size), size)
                     motion.distance = wp.length(out)
-                    motion.normal = wp.quat_rotate(turn, out)
+                    motion.normal = wp.quat_rotate(turn, wp.quat_rotate(further, out))
                     beside_box(slots, env, slot, box, size, c, e, half, r, motion)
                 else:
                     inside_box(slots, env, slot, box, size, c, e, half, r, near)
@@ -431,11 +446,13 @@ def make(real) -> dict:
                     slots.gap[env, slot + k] = real(NO_POINT)
                 ea = z_axis(a)
                 eb = z_axis(b)
-                motion = relative_motion(topology, bodies, env, sa, sb, middle, h)
+                motion = relative_motion(topology, bodies, env, sa, sb, h)
                 motion.near = near
-                ahead = d + motion.shift
-                e_ahead = wp.normalize(eb + wp.cross(motion.turn, eb))
-                motion.normal = outside_segment(ahead + e_ahead * nearest_to_segment(ahead, e_ahead, lb, ea, la), ea, la)
+                ahead = d + shift(topology, bodies, env, sb, middle, h) - shift(topology, bodies, env, sa, origin, h)
+                ea_ahead = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sa, h)), ea)
+                eb_ahead = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), eb)
+                nearest_ahead = ahead + eb_ahead * nearest_to_segment(ahead, eb_ahead, lb, ea_ahead, la)
+                motion.normal = outside_segment(nearest_ahead, ea_ahead, la)
                 motion.distance = wp.length(motion.normal)
 
                 nearest = d + eb * nearest_to_segment(d, eb, lb, ea, la)

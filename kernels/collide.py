@@ -24,7 +24,7 @@ SQUARE = wp.constant(1.0e-6)
 def pair_functions(real) -> SimpleNamespace:
     """Functions that every pair kernel uses."""
     t = scalar_types(real)
-    vec3, transform = t.vec3, t.transform
+    vec3, quat, transform = t.vec3, t.quat, t.transform
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
 
     @wp.func
@@ -95,6 +95,32 @@ def pair_functions(real) -> SimpleNamespace:
         return u
 
     @wp.func
+    def shape_turn(topology: Topology, bodies: Bodies, env: int, shape: int, h: real) -> vec3:
+        """How far a shape turns in h at its present velocity, rad, world axes."""
+        turn = vec3()
+        body = topology.shape_body[shape]
+        if body >= 0:
+            turn = h * wp.spatial_bottom(bodies.velocity[env, body])
+        return turn
+
+    @wp.func
+    def rotation(turn: vec3) -> quat:
+        """By this vector, up to its third power; exactly none by zero."""
+        half = real(0.5) * turn
+        return wp.normalize(quat(half[0], half[1], half[2], real(1.0)))
+
+    @wp.func
+    def shift(topology: Topology, bodies: Bodies, env: int, shape: int, p: vec3, h: real) -> vec3:
+        """How far a point p is carried with a shape in h at its present velocity, world axes."""
+        result = vec3()
+        body = topology.shape_body[shape]
+        if body >= 0:
+            arm = p - bodies.com[env, body]
+            turned = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, shape, h)), arm)
+            result = h * wp.spatial_top(bodies.velocity[env, body]) + (turned - arm)
+        return result
+
+    @wp.func
     def outside_box(p: vec3, size: vec3) -> vec3:
         """From the nearest point of a box to p, in the frame of the box; zero inside."""
         return p - vec3(wp.clamp(p[0], -size[0], size[0]), wp.clamp(p[1], -size[1], size[1]), wp.clamp(p[2], -size[2], size[2]))
@@ -104,15 +130,18 @@ def pair_functions(real) -> SimpleNamespace:
         """How much more distance is left after a motion than distance + n . closing, the tangent plane's.
 
         Of a point or segment from another shape; n and n_ahead point from the one to the other, n_ahead is of length distance_ahead.
-        What is left between the two as a whole counts, wherever it is. Nothing where they would meet, or pass through each
-        other: space behind an obstacle is not free.
+        What is left between the two as a whole counts, wherever it is. Less than the plane's is left only where shapes turn.
+        Nothing where they would meet, or pass through each other: space behind an obstacle is not free.
+
+        Shapes ahead are moved and turned by themselves: carried along its velocity in the axes of a turning shape, what stays
+        beside it would leave it on a tangent.
 
         The motion is that of present velocities, not of free ones: what supports a rolling sphere takes the fall that free
         motion adds, and an edge ahead must not take it too.
         """
         result = real(0.0)
         if distance_ahead > real(0.0) and wp.dot(n, n_ahead) > real(SQUARE) * distance_ahead:
-            result = wp.max(distance_ahead - distance - wp.dot(n, closing), real(0.0))
+            result = distance_ahead - distance - wp.dot(n, closing)
         return result
 
     @wp.func
@@ -135,6 +164,9 @@ def pair_functions(real) -> SimpleNamespace:
         far_apart=far_apart,
         set_apart=set_apart,
         shape_velocity=shape_velocity,
+        shape_turn=shape_turn,
+        rotation=rotation,
+        shift=shift,
         outside_box=outside_box,
         bend=bend,
         write=write,
@@ -153,7 +185,7 @@ def make(real) -> dict:
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f = pair_functions(real)
     shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
-    outside_box, bend = f.outside_box, f.bend
+    outside_box, bend, shape_turn, rotation, shift = f.outside_box, f.bend, f.shape_turn, f.rotation, f.shift
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def plane_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
@@ -216,7 +248,8 @@ def make(real) -> dict:
             gap = distance - ra - rb
             u = shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 1], b)
             u -= shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 0], a)
-            ahead = offset + h * u
+            ahead = offset + shift(topology, bodies, env, topology.pairs[pair, 1], b, h)
+            ahead -= shift(topology, bodies, env, topology.pairs[pair, 0], a, h)
             left = bend(distance, normal, h * u, wp.length(ahead), ahead)
             write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, left, 0)
 
@@ -254,10 +287,15 @@ def make(real) -> dict:
             normal = wp.transform_vector(box, inward)
             gap = distance - radius
             point = wp.transform_point(box, nearest) - normal * (real(0.5) * gap)
+            turn = wp.transform_get_rotation(box)
             u = shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 0], centre)
-            u -= shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 1], centre)
-            ahead = wp.transform_vector(box, outside_box(local + h * wp.quat_rotate_inv(wp.transform_get_rotation(box), u), size))
-            left = bend(distance, -normal, h * u, wp.length(ahead), ahead)
+            closing = h * (u - shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 1], centre))
+            # In the axes of the box, which turn as well.
+            move = shift(topology, bodies, env, topology.pairs[pair, 0], centre, h)
+            move -= shift(topology, bodies, env, topology.pairs[pair, 1], wp.transform_get_translation(box), h)
+            further = rotation(wp.quat_rotate_inv(turn, shape_turn(topology, bodies, env, topology.pairs[pair, 1], h)))
+            ahead = outside_box(wp.quat_rotate_inv(further, local + wp.quat_rotate_inv(turn, move)), size)
+            left = bend(distance, -normal, closing, wp.length(ahead), wp.quat_rotate(turn, wp.quat_rotate(further, ahead)))
             write_bent(slots, env, topology.pair_slots[pair], point, normal, gap, left, 0)
 
     return {

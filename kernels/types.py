@@ -97,13 +97,14 @@ def scalar_types(real) -> SimpleNamespace:
         inv_mass: wp.array2d(dtype=real)  # [E, B] zero where forces do not move the body
         inv_inertia: wp.array2d(dtype=mat33)  # [E, B] world axes, zero likewise
         free_velocity: wp.array2d(dtype=spatial)  # [E, B] v + h M^-1 (f_a - c)
+        jolt: wp.array2d(dtype=real)  # [E, B | 0] fastest approach of what hits the body in the step, m/s; 0 where none can hit another
 
     @wp.struct
     class Slots:
         point: wp.array2d(dtype=vec3)  # [E, C] world
         normal: wp.array2d(dtype=vec3)  # [E, C] from shape a to shape b
         gap: wp.array2d(dtype=real)  # [E, C] phi, m; huge where there is no point
-        bend: wp.array2d(dtype=real)  # [E, C] how much more gap the motion ahead leaves than phi + h u_n says, m
+        bend: wp.array2d(dtype=real)  # [E, C] gap that the motion ahead leaves, less phi + h u_n, m
         feature: wp.array2d(dtype=int)  # [E, C] which features touch
         # History, one step old:
         last_feature: wp.array2d(dtype=int)  # [E, C] -1 = was not in contact

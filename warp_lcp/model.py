@@ -215,6 +215,11 @@ class Model:
         return bool(self.restitution[self.pairs].any())
 
     @property
+    def bodies_meet(self) -> bool:
+        """Can two bodies touch, not only a body and the world?"""
+        return bool((self.shape_body[self.pairs] >= 0).all(axis=-1).any())
+
+    @property
     def max_contacts(self) -> int:
         """Contacts that may act at one time in one environment.
 

@@ -481,6 +481,7 @@ class Simulator:
         bundle.pose, bundle.velocity = self._array(b, t.transform), self._array(b, t.spatial)
         bundle.com, bundle.inv_mass, bundle.inv_inertia = self._array(b, t.vec3), self._array(b, self.real), self._array(b, t.mat33)
         bundle.free_velocity = self._array(b, t.spatial)
+        bundle.jolt = self._array(b if m.bodies_meet else 0, self.real)
         self.next_velocity = self._array(b, t.spatial)
 
         slots = self.slots = t.Slots()
