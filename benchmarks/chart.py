@@ -33,9 +33,7 @@ from .scenes import Scene
 CHARTED = [name for name, case in CASES.items() if case.charted]
 STEPS = (1e-2, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4)
 QUICK_STEPS = (1e-2, 2e-3)
-#: Environments that are timed together, where a case is not slow.
-ENVS = {"stack10": 8, "rolling": 8, "heap": 8}
-USUAL_ENVS = 64
+ENVS = 64  # that are timed together
 TIMED, LEAST_STEPS, MOST_STEPS = 0.2, 20, 400  # s of simulated time that are timed, within these numbers of steps
 TURNS, LEAST_TURN = 3, 0.05  # s: a turn repeats a short run for so long and keeps its median
 PATIENCE = 20.0  # s that a run from beginning to end may be expected to take
@@ -64,11 +62,6 @@ OURS = (
     Ours("AP, k = 2 to 16", {"formulation": "anitescu_potra"}, (2, 4, 8, 16)),
 )
 KNOB_STEP = 1e-3  # s, where the knob is another one
-
-
-def envs(case: str) -> int:
-    """Environments that are timed together."""
-    return ENVS.get(case, USUAL_ENVS)
 
 
 def point(case: Case, moved: Motion, engine: str, setting: str, knob: str, h: float) -> dict[str, Any]:
@@ -117,7 +110,7 @@ def part(case: Case, h: float, env_step: float = 0.0) -> Scene:
     scene = replace(case.scene(h), pose=pose, velocity=velocity)
     number = min(max(LEAST_STEPS, round(TIMED / h)), MOST_STEPS)
     most = TURN / (env_step * number) if env_step else math.inf
-    return replace(scene.copies(int(min(envs(case.name), max(LEAST_ENVS, most)))), steps=number)
+    return replace(scene.copies(int(min(ENVS, max(LEAST_ENVS, most)))), steps=number)
 
 
 def energy_errors(moved: Motion) -> dict[str, float | None]:

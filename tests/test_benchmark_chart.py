@@ -82,7 +82,7 @@ def fake(tmp_path) -> peers.Peer:
 def test_measured_points(fake, tmp_path, monkeypatch):
     """Ours and a peer's on the launched cube: errors by hand, times of both, and what the peer could not do."""
     monkeypatch.setattr(chart, "QUICK_STEPS", (1e-2,))
-    monkeypatch.setattr(chart, "USUAL_ENVS", 2)
+    monkeypatch.setattr(chart, "ENVS", 2)
     (rows,) = chart.measure(["slip_to_roll"], [fake], tmp_path, "cpu", quick=True)
     mine = {row["setting"]: row for row in rows if row["engine"] == "warp_lcp"}
     theirs = {row["setting"]: row for row in rows if row["engine"] == "fake"}
