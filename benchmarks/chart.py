@@ -297,6 +297,16 @@ def beaten(row: dict[str, Any], mine: list[dict[str, Any]]) -> bool:
     return any(own["per_ms_us"] < row["per_ms_us"] and error(own) < error(row) for own in mine)
 
 
+def lead(theirs: list[dict[str, Any]], mine: list[dict[str, Any]]) -> str:
+    """The smallest error of an engine, and how many times as fast ours is that errs no more; with the spread of both times."""
+    best = min(theirs, key=lambda row: (error(row), row["per_ms_us"]))
+    own = min((own for own in mine if error(own) <= error(best)), key=lambda own: own["per_ms_us"], default=None)
+    if own is None:
+        return f"{best['error']:.1e}: none"
+    ratio = best["per_ms_us"] / own["per_ms_us"]
+    return f"{best['error']:.1e}: {ratio:.3g} ± {50 * (best['spread'] + own['spread']):.0f} %"
+
+
 def markdown(rows: list[dict[str, Any]]) -> str:
     """Who is on the front of each case, and which points of others none of ours beats in both."""
     lines = []
@@ -320,6 +330,14 @@ def markdown(rows: list[dict[str, Any]]) -> str:
             for engine in engines:
                 theirs = [row for row in good if row["case"] == name and row["engine"] == engine]
                 cells.append(f"{sum(beaten(row, mine) for row in theirs)} of {len(theirs)}" if theirs else "-")
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        lines += ["", "Smallest error of each, and how many times as fast the fastest of ours is that errs no more:", ""]
+        lines += ["| case | " + " | ".join(engines) + " |", "|" + " --- |" * (len(engines) + 1)]
+        for name in cases:
+            of_case = {
+                engine: [row for row in good if row["case"] == name and row["engine"] == engine] for engine in ("warp_lcp", *engines)
+            }
+            cells = [lead(of_case[engine], of_case["warp_lcp"]) if of_case[engine] else "-" for engine in engines]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
         lines += ["", "Not beaten:", ""]
         for name in cases:

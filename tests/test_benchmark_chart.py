@@ -67,6 +67,15 @@ def test_table():
     assert "- box: mujoco stiff, 10 ms: 2 us/ms, 3.0e-01 m; our best that is faster: 1.0e+00" in text
 
 
+def test_lead():
+    """Times at the error of the other's best point; the slower of two of ours does not count, nor one that errs more."""
+    mine = [point(time=1.0, error=2.0), point(time=2.0, error=0.5), point(time=9.0, error=0.4)]
+    theirs = [point("mujoco", time=3.0, error=5.0), point("mujoco", time=10.0, error=0.5)]
+    assert chart.lead(theirs, mine) == "5.0e-01: 5 ± 10 %"
+    assert chart.lead([point("mujoco", error=0.3)], mine) == "3.0e-01: none"
+    assert "| box | 5.0e-01: 5 ± 10 % |" in chart.markdown(mine + theirs)
+
+
 @pytest.fixture
 def fake(tmp_path) -> peers.Peer:
     """A peer in tmp_path whose bodies glide on for ever."""
