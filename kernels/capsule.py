@@ -219,7 +219,7 @@ def make(real) -> dict:
             carried = wp.cross(motion.turn_b, p - motion.com_b)
             along = motion.shift + carried  # of p relative to com_a
             around = wp.cross(motion.turn_a, p - motion.com_a)
-            left = bend(distance, n, along - around, motion.distance, motion.normal)
+            left = bend(gap, distance, n, along - around, motion.distance, motion.normal)
             # Not another point of the segment that comes nearer, which has a row of its own: what turning takes from this one.
             curl = wp.cross(motion.turn_b, carried) - real(2.0) * wp.cross(motion.turn_a, along) + wp.cross(motion.turn_a, around)
             left = wp.max(left, wp.min(real(0.5) * wp.dot(n, curl), real(0.0)))
@@ -262,7 +262,7 @@ def make(real) -> dict:
             closing = h * (u - shape_velocity(topology, bodies, bodies.velocity, env, sb, centre))
             move = shift(topology, bodies, env, sa, centre, h) - shift(topology, bodies, env, sb, centre - p, h)
             ahead = outside_segment(p + move, wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), axis), half)
-            b = bend(distance, n, closing, wp.length(ahead), ahead)
+            b = bend(gap, distance, n, closing, wp.length(ahead), ahead)
             write_bent(slots, env, topology.pair_slots[pair], centre - n * (ra + real(0.5) * gap), -n, gap, b, 0)
 
     @wp.func

@@ -18,6 +18,8 @@ NO_POINT = wp.constant(1.0e30)
 FAR_PAIR = wp.constant(2.0e30)
 # Cosine: directions from faces of a box that are square to each other, rotated to world axes, agree by less than this.
 SQUARE = wp.constant(1.0e-6)
+# Of the distance: shapes that overlap by less ahead do not meet; static deflections are less.
+HAIR = wp.constant(1.0e-4)
 
 
 @functools.cache
@@ -126,12 +128,16 @@ def pair_functions(real) -> SimpleNamespace:
         return p - vec3(wp.clamp(p[0], -size[0], size[0]), wp.clamp(p[1], -size[1], size[1]), wp.clamp(p[2], -size[2], size[2]))
 
     @wp.func
-    def bend(distance: real, n: vec3, closing: vec3, distance_ahead: real, n_ahead: vec3) -> real:
-        """How much more distance is left after a motion than distance + n . closing, the tangent plane's.
+    def bend(gap: real, distance: real, n: vec3, closing: vec3, distance_ahead: real, n_ahead: vec3) -> real:
+        """How much more gap is left after a motion than gap + n . closing, the tangent plane's.
 
         Of a point or segment from another shape; n and n_ahead point from the one to the other, n_ahead is of length distance_ahead.
         What is left between the two as a whole counts, wherever it is. Less than the plane's is left only where shapes turn.
-        Nothing where they would meet, or pass through each other: space behind an obstacle is not free.
+
+        Nothing where they pass through each other: space behind an obstacle is not free. Where they meet, what is bent until
+        then, as the motion goes on otherwise: a part that falls with the square of the time. (With all of it a capsule that falls
+        on an edge at 8 m/s and sticks enters a box by 27 mm at 10 ms.) By a hair, as what rolls on to the next tile meets it, and
+        its edge on the way, they do not meet.
 
         Shapes ahead are moved and turned by themselves: carried along its velocity in the axes of a turning shape, what stays
         beside it would leave it on a tangent.
@@ -141,7 +147,13 @@ def pair_functions(real) -> SimpleNamespace:
         """
         result = real(0.0)
         if distance_ahead > real(0.0) and wp.dot(n, n_ahead) > real(SQUARE) * distance_ahead:
-            result = distance_ahead - distance - wp.dot(n, closing)
+            change = wp.dot(n, closing)
+            result = distance_ahead - distance - change
+            after = gap + (distance_ahead - distance) + real(HAIR) * distance
+            if gap > real(0.0) and after < real(0.0) and result > real(0.0):
+                # gap + change t + result t^2 = 0
+                t = real(2.0) * gap / (wp.sqrt(wp.max(change * change - real(4.0) * result * gap, real(0.0))) - change)
+                result = wp.max(result * t * t, result + real(4.0) * after)
         return result
 
     @wp.func
@@ -250,7 +262,7 @@ def make(real) -> dict:
             u -= shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 0], a)
             ahead = offset + shift(topology, bodies, env, topology.pairs[pair, 1], b, h)
             ahead -= shift(topology, bodies, env, topology.pairs[pair, 0], a, h)
-            left = bend(distance, normal, h * u, wp.length(ahead), ahead)
+            left = bend(gap, distance, normal, h * u, wp.length(ahead), ahead)
             write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, left, 0)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
@@ -295,7 +307,7 @@ def make(real) -> dict:
             move -= shift(topology, bodies, env, topology.pairs[pair, 1], wp.transform_get_translation(box), h)
             further = rotation(wp.quat_rotate_inv(turn, shape_turn(topology, bodies, env, topology.pairs[pair, 1], h)))
             ahead = outside_box(wp.quat_rotate_inv(further, local + wp.quat_rotate_inv(turn, move)), size)
-            left = bend(distance, -normal, closing, wp.length(ahead), wp.quat_rotate(turn, wp.quat_rotate(further, ahead)))
+            left = bend(gap, distance, -normal, closing, wp.length(ahead), wp.quat_rotate(turn, wp.quat_rotate(further, ahead)))
             write_bent(slots, env, topology.pair_slots[pair], point, normal, gap, left, 0)
 
     return {
