@@ -170,7 +170,7 @@ def make(real) -> dict:
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f, g = pair_functions(real), segment_functions(real)
     shape_pose, reach, set_apart, shape_velocity = f.shape_pose, f.reach, f.set_apart, f.shape_velocity
-    shape_turn, rotation, shift = f.shape_turn, f.rotation, f.shift
+    far_apart, shape_turn, rotation, shift = f.far_apart, f.shape_turn, f.rotation, f.shift
     write, write_bent = f.write, f.write_bent
     outside_box, bend, whole, cut, direction, perpendicular = f.outside_box, f.bend, g.whole, g.cut, g.direction, g.perpendicular
     outside_segment, nearest_to_box, nearest_to_segment = g.outside_segment, g.nearest_to_box, g.nearest_to_segment
@@ -247,11 +247,14 @@ def make(real) -> dict:
             pair = first + i
             sa = topology.pairs[pair, 0]
             sb = topology.pairs[pair, 1]
-            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, sa))
-            capsule = shape_pose(topology, bodies, env, sb)
             ra = topology.shape_size[sa][0]
             rb = topology.shape_size[sb][0]
             half = topology.shape_size[sb][1]
+            if far_apart(topology, bodies, env, sa, sb, ra, half + rb, h):
+                set_apart(topology, slots, env, pair)
+                continue
+            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, sa))
+            capsule = shape_pose(topology, bodies, env, sb)
             axis = z_axis(capsule)
             p = centre - wp.transform_get_translation(capsule)
             out = outside_segment(p, axis, half)

@@ -197,6 +197,7 @@ def make(real) -> dict:
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
     f = pair_functions(real)
     shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
+    far_apart, set_apart, sum_norm = f.far_apart, f.set_apart, f.sum_norm
     outside_box, bend, shape_turn, rotation, shift = f.outside_box, f.bend, f.shape_turn, f.rotation, f.shift
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
@@ -248,10 +249,13 @@ def make(real) -> dict:
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
-            a = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
-            b = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
             ra = topology.shape_size[topology.pairs[pair, 0]][0]
             rb = topology.shape_size[topology.pairs[pair, 1]][0]
+            if far_apart(topology, bodies, env, topology.pairs[pair, 0], topology.pairs[pair, 1], ra, rb, h):
+                set_apart(topology, slots, env, pair)
+                continue
+            a = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
+            b = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
             offset = b - a
             distance = wp.length(offset)
             normal = vec3(real(0.0), real(0.0), real(1.0))  # concentric spheres have none: any will part them
@@ -270,10 +274,13 @@ def make(real) -> dict:
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
-            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
             radius = topology.shape_size[topology.pairs[pair, 0]][0]
-            box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
             size = topology.shape_size[topology.pairs[pair, 1]]
+            if far_apart(topology, bodies, env, topology.pairs[pair, 0], topology.pairs[pair, 1], radius, sum_norm(size), h):
+                set_apart(topology, slots, env, pair)
+                continue
+            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
+            box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
             local = wp.transform_point(wp.transform_inverse(box), centre)
             inward = -outside_box(local, size)
             nearest = local + inward

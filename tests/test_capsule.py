@@ -159,7 +159,7 @@ def test_sphere_capsule():
     """The nearest point of the axis, to 1e-12."""
     rng = np.random.default_rng(2)
     q = random_poses(rng, 400, 0.3)
-    point, normal, gap, _ = slots(pair(sphere(), capsule()), q)
+    point, normal, gap, _ = slots(pair(sphere(), capsule()), q, np.tile(20 * FAST, (400, 1)), dt=1e-2)
     expected = outside_segment(q[:, 1], HALF, q[:, 0, None, :3])[:, 0] - R - R2
     assert gap[:, 0] == pytest.approx(expected, abs=1e-12)
     assert (expected < 0).sum() > 50
