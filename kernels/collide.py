@@ -40,8 +40,8 @@ def pair_functions(real) -> SimpleNamespace:
 
     @wp.func
     def reach(topology: Topology, bodies: Bodies, env: int, shape: int, centre: vec3, radius: real, h: real) -> real:
-        """How far a point within `radius` of `centre` travels with a shape in 2 h, and a hundredth of the radius."""
-        travel = real(0.01) * radius + real(2.0) * h * wp.length(topology.surface_velocity[shape])
+        """How far a point within `radius` of `centre` travels with a shape in 2 h, and a twentieth of the radius."""
+        travel = real(0.05) * radius + real(2.0) * h * wp.length(topology.surface_velocity[shape])
         body = topology.shape_body[shape]
         if body >= 0:
             twist = bodies.free_velocity[env, body]
@@ -57,7 +57,7 @@ def pair_functions(real) -> SimpleNamespace:
     def widest_reach(topology: Topology, bodies: Bodies, env: int, shape: int, radius: real, h: real):
         """Centre of a shape, and at least radius + ``reach``, without a root."""
         centre = wp.transform_get_translation(topology.shape_pose[shape])
-        far = real(1.02) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
+        far = real(1.06) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
         body = topology.shape_body[shape]
         if body >= 0:
             centre = wp.transform_point(bodies.pose[env, body], centre)
