@@ -7,11 +7,13 @@ from types import SimpleNamespace
 import warp as wp
 
 from .collide import NO_POINT, pair_functions
+from .contacts import ELASTIC_RANGE
 from .types import OPTIONS, scalar_types
 
-# Of the smallest half extent: boxes that overlap by no more along an axis count as touching, which is how soft ones rest; those that
-# graze an edge, too, and end so deep in its side.
+# Boxes that overlap along an axis by no more count as touching there. What rests does, so deep as its load presses it in. What
+# grazes an edge does not, but is not told from it, and ends so deep in its side: least and most of the smallest half extent.
 TOUCHING = wp.constant(0.03)
+SUNK = wp.constant(0.1)
 
 
 @functools.cache
@@ -134,7 +136,7 @@ def make(real):
     """Kernel ``box_box``; launch with dim (E, pairs of boxes)."""
     t = scalar_types(real)
     vec3, mat33, transform = t.vec3, t.mat33, t.transform
-    Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
+    Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, a, p = pair_functions(real), axes(real), polygon(real)
     shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
     sum_norm, far_apart, set_apart = f.sum_norm, f.far_apart, f.set_apart
@@ -336,7 +338,7 @@ def make(real):
         return result
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def box_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+    def box_box(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, index = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + index
@@ -373,7 +375,13 @@ def make(real):
                 # Prefer faces over edges and a over b, so that equal separations do not flip from step to step.
                 smallest = wp.min(wp.min(ha), wp.min(hb))
                 bias = real(1.0e-3) * smallest
-                touching = real(TOUCHING) * smallest
+                inverse_a = inverse_mass(topology, bodies, env, sa)
+                inverse_b = inverse_mass(topology, bodies, env, sb)
+                load = wp.length(parameters.gravity[env % parameters.gravity.shape[0]]) / wp.max(
+                    wp.max(inverse_a, inverse_b), real(1.0e-30)
+                )
+                stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
+                touching = wp.clamp(real(ELASTIC_RANGE) * load / stiffness, real(TOUCHING) * smallest, real(SUNK) * smallest)
                 far = real(2.0) * apart
                 best = real(-2.0) * far
                 axis = int(0)
@@ -398,8 +406,6 @@ def make(real):
                             best_edge = s
                             axis = 6 + ij
                 # Levers are those of the lighter box, which turns more easily.
-                inverse_a = inverse_mass(topology, bodies, env, sa)
-                inverse_b = inverse_mass(topology, bodies, env, sb)
                 share = real(0.5)
                 if inverse_a + inverse_b > real(0.0):
                     share = inverse_b / (inverse_a + inverse_b)

@@ -167,7 +167,7 @@ def make(real) -> dict:
     """Kernels by the names of the two shape types; launch with dim (E, pairs of that kind), as those of ``collide``."""
     t = scalar_types(real)
     vec3, transform = t.vec3, t.transform
-    Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
+    Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, g = pair_functions(real), segment_functions(real)
     shape_pose, reach, set_apart, shape_velocity = f.shape_pose, f.reach, f.set_apart, f.shape_velocity
     far_apart, shape_turn, rotation, shift = f.far_apart, f.shape_turn, f.rotation, f.shift
@@ -226,7 +226,7 @@ def make(real) -> dict:
             write_bent(slots, env, slot, p - n * (radius + real(0.5) * gap), n, gap, left, feature)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def plane_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+    def plane_capsule(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
@@ -241,7 +241,7 @@ def make(real) -> dict:
                 write(slots, env, topology.pair_slots[pair] + k, point, normal, gap, 0)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def sphere_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+    def sphere_capsule(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
@@ -387,7 +387,7 @@ def make(real) -> dict:
             in_edge(slots, env, slot, box, size, c, e, half, r, normal, axis - 3)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def box_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+    def box_capsule(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
@@ -427,7 +427,7 @@ def make(real) -> dict:
                 set_apart(topology, slots, env, pair)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def capsule_capsule(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+    def capsule_capsule(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i

@@ -18,8 +18,10 @@ NO_POINT = wp.constant(1.0e30)
 FAR_PAIR = wp.constant(2.0e30)
 # Cosine: directions from faces of a box that are square to each other, rotated to world axes, agree by less than this.
 SQUARE = wp.constant(1.0e-6)
-# Of the distance: shapes that overlap by less ahead do not meet; static deflections are less.
-HAIR = wp.constant(1.0e-4)
+# Of the distance: shapes that overlap by less ahead do not meet, as what rests on both and sinks in does not.
+HAIR = wp.constant(1.0e-3)
+# How many times what they overlap by beyond that is taken from what is bent, which so fades out.
+FADING = wp.constant(4.0)
 
 
 @functools.cache
@@ -40,13 +42,15 @@ def pair_functions(real) -> SimpleNamespace:
 
     @wp.func
     def reach(topology: Topology, bodies: Bodies, env: int, shape: int, centre: vec3, radius: real, h: real) -> real:
-        """How far a point within `radius` of `centre` travels with a shape in 2 h, and a twentieth of the radius."""
-        travel = real(0.05) * radius + real(2.0) * h * wp.length(topology.surface_velocity[shape])
+        """How far a point within `radius` of `centre` travels with a shape in 2 h, hit or not, and a hundredth of the radius."""
+        travel = real(0.01) * radius + real(2.0) * h * wp.length(topology.surface_velocity[shape])
         body = topology.shape_body[shape]
         if body >= 0:
             twist = bodies.free_velocity[env, body]
             lever = radius + wp.length(centre - bodies.com[env, body])
             travel += real(2.0) * h * (wp.length(wp.spatial_top(twist)) + wp.length(wp.spatial_bottom(twist)) * lever)
+            if bodies.alert.shape[0] > 0:
+                travel += real(2.0) * h * bodies.alert[env]
         return travel
 
     @wp.func
@@ -57,13 +61,15 @@ def pair_functions(real) -> SimpleNamespace:
     def widest_reach(topology: Topology, bodies: Bodies, env: int, shape: int, radius: real, h: real):
         """Centre of a shape, and at least radius + ``reach``, without a root."""
         centre = wp.transform_get_translation(topology.shape_pose[shape])
-        far = real(1.06) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
+        far = real(1.02) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
         body = topology.shape_body[shape]
         if body >= 0:
             centre = wp.transform_point(bodies.pose[env, body], centre)
             twist = bodies.free_velocity[env, body]
             lever = radius + sum_norm(centre - bodies.com[env, body])
             far += real(2.0) * h * (sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
+            if bodies.alert.shape[0] > 0:
+                far += real(2.0) * h * bodies.alert[env]
         return centre, far
 
     @wp.func
@@ -107,7 +113,7 @@ def pair_functions(real) -> SimpleNamespace:
 
     @wp.func
     def rotation(turn: vec3) -> quat:
-        """By this vector, up to its third power; exactly none by zero."""
+        """By this vector, but for its third power / 12; exactly none by zero."""
         half = real(0.5) * turn
         return wp.normalize(quat(half[0], half[1], half[2], real(1.0)))
 
@@ -153,7 +159,7 @@ def pair_functions(real) -> SimpleNamespace:
             if gap > real(0.0) and after < real(0.0) and result > real(0.0):
                 # gap + change t + result t^2 = 0
                 t = real(2.0) * gap / (wp.sqrt(wp.max(change * change - real(4.0) * result * gap, real(0.0))) - change)
-                result = wp.max(result * t * t, result + real(4.0) * after)
+                result = wp.max(result * t * t, result + real(FADING) * after)
         return result
 
     @wp.func
@@ -194,14 +200,14 @@ def make(real) -> dict:
     """
     t = scalar_types(real)
     vec3 = t.vec3
-    Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
+    Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f = pair_functions(real)
     shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
     far_apart, set_apart, sum_norm = f.far_apart, f.set_apart, f.sum_norm
     outside_box, bend, shape_turn, rotation, shift = f.outside_box, f.bend, f.shape_turn, f.rotation, f.shift
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def plane_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+    def plane_sphere(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
@@ -214,7 +220,7 @@ def make(real) -> dict:
             write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def plane_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+    def plane_box(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
@@ -245,7 +251,7 @@ def make(real) -> dict:
                     slots.gap[env, slot + k] = real(NO_POINT)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def sphere_sphere(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+    def sphere_sphere(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
@@ -270,7 +276,7 @@ def make(real) -> dict:
             write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, left, 0)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def sphere_box(topology: Topology, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
+    def sphere_box(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i

@@ -18,15 +18,13 @@ from . import rigid
 from .collide import FAR_PAIR, NO_POINT, pair_functions
 from .types import CONE, DISC, FACETS, FREE, OPTIONS, OVERFLOW, REGULARIZED, scalar_types
 
-# Overlaps that no load explains are pushed apart no faster than this [m/s], whatever the stiffness.
+# Overlaps that no load explains are pushed apart no faster than this [m/s], whatever the stiffness; what turns comes on top.
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
 # A contact that opens by more than this many static deflections under its weight has separated; one that is deeper than as
 # many under its weight or last impulse overlaps for another reason.
 ELASTIC_RANGE = wp.constant(10.0)
-# Times that contacts are selected at most. A hit is handed on once a time, more often along pairs in their order.
-HANDED_ON = wp.constant(8)
-# Where turning shapes leave the tangent plane a contact leaves with this part at most of the speed with which it comes, or, with
-# friction, it gains energy: a heap at 5 ms by 2e-3 of its own with all of it, by 1e-5 with half.
+# Where turning shapes leave the tangent plane a contact leaves with this part at most of the speed with which it comes. A half is
+# what a point on a circle needs along its chords; with all of it friction makes energy, 2e-3 of a heap's at 5 ms, 1e-5 with half.
 GIVEN_BACK = wp.constant(0.5)
 # A predicted slip under this part of the free velocity is round-off and has no direction.
 NO_SLIP = wp.constant(1.0e-6)
@@ -150,7 +148,6 @@ def row_functions(real) -> SimpleNamespace:
         # loaded ones beside it, which is what makes redundant normal forces unique.
         eps_n = real(1.0) / (k_n * h * h + b_n * h)
         closed = phi <= real(0.0) or (history.touched and phi * k_n * h <= real(ELASTIC_RANGE) * weight)
-        # A gap that turning closes opens as much again, a half each step: what moves on a circle along its chords.
         turned = wp.clamp(real(GIVEN_BACK) * h * wp.dot(n, u), wp.min(bend, real(0.0)), real(0.0))
         d_n = (phi + wp.max(bend, real(0.0)) + turned) / h
         if closed:
@@ -351,6 +348,117 @@ def make(real) -> SimpleNamespace:
                 c_b[k] = parameters.contact[i % parameters.contact.shape[0], b, k]
             parameters.pair_contact[i, pair] = contact_parameters(c_a, c_b, mass)
 
+    @wp.func
+    def share(bodies: Bodies, env: int, body: wp.vec2i, side: int) -> real:
+        """Of the speed of a hit, how much the body on this side may take on: all, unless the other one is lighter."""
+        w = real(0.0)
+        other = real(0.0)
+        for k in range(2):
+            if body[k] >= 0:
+                if k == side:
+                    w = bodies.inv_mass[env, body[k]]
+                else:
+                    other = bodies.inv_mass[env, body[k]]
+        result = real(0.0)
+        if w > real(0.0):
+            result = wp.min(real(2.0) * w / (w + other), real(1.0))
+        return result
+
+    @wp.func
+    def select(
+        topology: Topology,
+        bodies: Bodies,
+        slots: Slots,
+        env: int,
+        h: real,
+        fall: real,
+        again: bool,
+        contacts: Contacts,
+        status: wp.array(dtype=int),
+    ) -> int:
+        """Slots whose gap could close; again: once hits are known, else they are looked for. Returns their number."""
+        meet = bodies.hit.shape[1] > 0
+        if meet and not again:
+            for b in range(bodies.hit.shape[1]):
+                bodies.hit[env, b] = real(0.0)
+        alert = real(0.0)
+        count = int(0)
+        for pair in range(topology.pairs.shape[0]):
+            first = topology.pair_slots[pair]
+            if slots.gap[env, first] == real(FAR_PAIR):
+                continue
+            body = topology.pair_body[pair]
+            hit = real(0.0)
+            if again:
+                for side in range(2):
+                    if body[side] >= 0:
+                        hit += bodies.hit[env, body[side]]
+            for slot in range(first, topology.pair_slots[pair + 1]):
+                phi = slots.gap[env, slot]
+                selected = bool(False)
+                if phi < real(NO_POINT):
+                    u, u_free = velocities(topology, bodies, env, pair, slots.point[env, slot])
+                    # Twice the speed counts, not its approaching part: an impact elsewhere on the body turns one into the
+                    # other (1.1 mm of overlap at 1 ms with the approaching part alone, 3 um with this).
+                    ahead = phi - fall - real(2.0) * h * hit
+                    if ahead < real(0.0) or ahead * ahead < real(4.0) * h * h * wp.length_sq(u_free):
+                        if count < contacts.slot.shape[1]:
+                            contacts.slot[env, count] = slot
+                            contacts.velocity[env, count] = u
+                            contacts.free[env, count] = u_free
+                            count += 1
+                            selected = True
+                        else:
+                            status[env] = status[env] | OVERFLOW  # for good: the second time there are no fewer
+                    if meet and not again:
+                        # Of present velocities: what gravity or a wrench presses together does not hit.
+                        closing = -h * wp.dot(slots.normal[env, slot], u)
+                        left = phi + wp.max(slots.bend[env, slot], real(0.0))
+                        if closing > real(0.1) * fall and real(2.0) * closing + fall > left:
+                            alert = wp.max(alert, closing / h)
+                            if closing + fall > left:
+                                for side in range(2):
+                                    if body[side] >= 0:
+                                        speed = share(bodies, env, body, side) * closing / h
+                                        bodies.hit[env, body[side]] = wp.max(bodies.hit[env, body[side]], speed)
+                if not selected:
+                    slots.last_feature[env, slot] = -1
+        if meet and not again:
+            bodies.alert[env] = alert
+        return count
+
+    @wp.func
+    def hand_on(topology: Topology, bodies: Bodies, slots: Slots, env: int, h: real) -> bool:
+        """What a hit body may hit in turn within the step, up and down the pairs until nothing changes. Is there a hit at all?"""
+        news = bool(False)
+        for b in range(bodies.hit.shape[1]):
+            if bodies.hit[env, b] > real(0.0):
+                news = True
+        any_hit = news
+        down = bool(False)
+        pairs = topology.pairs.shape[0]
+        while news:
+            news = bool(False)
+            for k in range(pairs):
+                pair = k
+                if down:
+                    pair = pairs - 1 - k
+                body = topology.pair_body[pair]
+                if body[0] >= 0 and body[1] >= 0:
+                    fastest = wp.max(bodies.hit[env, body[0]], bodies.hit[env, body[1]])
+                    closes = bool(False)
+                    if fastest > real(0.0) and slots.gap[env, topology.pair_slots[pair]] != real(FAR_PAIR):
+                        for slot in range(topology.pair_slots[pair], topology.pair_slots[pair + 1]):
+                            closes = closes or slots.gap[env, slot] < h * fastest
+                    if closes:
+                        for side in range(2):
+                            speed = share(bodies, env, body, side) * bodies.hit[env, body[1 - side]]
+                            if speed > real(1.01) * bodies.hit[env, body[side]]:
+                                bodies.hit[env, body[side]] = speed
+                                news = bool(True)
+            down = not down
+        return any_hit
+
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def select_contacts(
         topology: Topology,
@@ -371,57 +479,9 @@ def make(real) -> SimpleNamespace:
         start, _ = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
             fall = h * h * wp.length(parameters.gravity[env % parameters.gravity.shape[0]]) + real(1.0e-9)
-            for b in range(bodies.jolt.shape[1]):
-                bodies.jolt[env, b] = real(0.0)
-            news = bool(True)
-            count = int(0)
-            for attempt in range(HANDED_ON):
-                if not news:
-                    break
-                news = bool(False)
-                count = int(0)
-                for pair in range(topology.pairs.shape[0]):
-                    first = topology.pair_slots[pair]
-                    if slots.gap[env, first] == real(FAR_PAIR):
-                        continue
-                    body = topology.pair_body[pair]
-                    both = real(0.0)
-                    most = real(0.0)
-                    if attempt > 0:
-                        for side in range(2):
-                            if body[side] >= 0:
-                                both += bodies.jolt[env, body[side]]
-                                most = wp.max(most, bodies.jolt[env, body[side]])
-                    push = real(0.0)
-                    for slot in range(first, topology.pair_slots[pair + 1]):
-                        phi = slots.gap[env, slot]
-                        selected = bool(False)
-                        if phi < real(NO_POINT):
-                            u, u_free = velocities(topology, bodies, env, pair, slots.point[env, slot])
-                            # Twice the speed counts, not its approaching part: an impact elsewhere on the body turns one into
-                            # the other (1.1 mm of overlap at 1 ms with the approaching part alone, 3 um with this).
-                            ahead = phi - fall - real(2.0) * h * both
-                            if ahead < real(0.0) or ahead * ahead < real(4.0) * h * h * wp.length_sq(u_free):
-                                if count < contacts.slot.shape[1]:
-                                    contacts.slot[env, count] = slot
-                                    contacts.velocity[env, count] = u
-                                    contacts.free[env, count] = u_free
-                                    count += 1
-                                    selected = True
-                                else:
-                                    status[env] = status[env] | OVERFLOW
-                                # What gravity does in two steps is no hit.
-                                closing = -h * wp.dot(slots.normal[env, slot], u_free)
-                                if closing > phi and closing > real(2.0) * fall:
-                                    push = wp.max(push, closing / h)
-                                if phi < h * most:
-                                    push = wp.max(push, most)
-                        if not selected:
-                            slots.last_feature[env, slot] = -1
-                    for side in range(2):
-                        if body[side] >= 0 and bodies.jolt.shape[1] > 0 and push > real(1.01) * bodies.jolt[env, body[side]]:
-                            bodies.jolt[env, body[side]] = push
-                            news = True
+            count = select(topology, bodies, slots, env, h, fall, False, contacts, status)
+            if hand_on(topology, bodies, slots, env, h):
+                count = select(topology, bodies, slots, env, h, fall, True, contacts, status)
             contacts.count[env] = count
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)

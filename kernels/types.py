@@ -97,7 +97,9 @@ def scalar_types(real) -> SimpleNamespace:
         inv_mass: wp.array2d(dtype=real)  # [E, B] zero where forces do not move the body
         inv_inertia: wp.array2d(dtype=mat33)  # [E, B] world axes, zero likewise
         free_velocity: wp.array2d(dtype=spatial)  # [E, B] v + h M^-1 (f_a - c)
-        jolt: wp.array2d(dtype=real)  # [E, B | 0] fastest approach of what hits the body in the step, m/s; 0 where none can hit another
+        # Where no two free bodies can touch neither is there.
+        hit: wp.array2d(dtype=real)  # [E, B | 0] speed that the body may take on in the step from what hits it, m/s
+        alert: wp.array(dtype=real)  # [E | 0] fastest approach of what hits something in this step or the next, m/s
 
     @wp.struct
     class Slots:

@@ -322,8 +322,24 @@ def last(what: str) -> dict:
     return json.loads(sorted((ROOT / "benchmarks" / "results").glob(f"*-{what}-cpu.json"))[-1].read_text())
 
 
-def test_the_document_holds_the_tables_of_the_results():
-    assert report.tables("accuracy", ROOT / "docs" / "accuracy.md") == accuracy.markdown(last("accuracy")["rows"])
+TABLES = {
+    "accuracy": lambda data: accuracy.markdown(data["rows"]),
+    "stability": lambda data: stability.markdown(data["rows"], data["crowds"]),
+    "chart": lambda data: chart.markdown(data["rows"]),
+}
+
+
+@pytest.mark.parametrize("what", TABLES)
+def test_the_document_holds_the_tables_of_the_results(what):
+    assert report.tables(what, ROOT / "docs" / f"{what}.md") == TABLES[what](last(what))
+
+
+@pytest.mark.parametrize(("name", "key"), [("chart", "error"), ("chart_energy", "E_uc")])
+def test_the_pictures_hold_the_points_of_the_results(name, key):
+    """All of them and no other, by their titles."""
+    rows = [row for row in last("chart")["rows"] if chart.counts(row) and row.get(key) is not None]
+    titles = [element.text for element in ElementTree.parse(ROOT / "docs" / f"{name}.svg").iter(f"{{{pictures.SVG}}}title")]
+    assert sorted(titles) == sorted(chart_picture.title(row) for row in rows)
 
 
 def test_cases_that_are_taken_without_being_named():

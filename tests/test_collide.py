@@ -6,7 +6,7 @@ import pytest
 from conftest import random_quaternions, simulator
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
-from warp_lcp.kernels.collide import FAR_PAIR, NO_POINT
+from warp_lcp.kernels.collide import FADING, FAR_PAIR, HAIR, NO_POINT
 
 import warp_lcp as wl
 from warp_lcp.builder import rotation_matrix
@@ -288,7 +288,7 @@ def test_open_gaps_of_spheres_count_what_the_motion_ahead_leaves(kind):
     """gap + h n . u + bend is the gap a step ahead where the sphere passes by, and nothing is added where it passes through.
 
     Where its centre would cross the box, or end behind the other centre, the tangent plane alone counts; where the two meet on
-    the way, part of it, so that gap + t h n . u + t^2 bend is zero for some t < 1, or, by a hair, all but four times the overlap.
+    the way, part of it, so that gap + t h n . u + t^2 bend is zero for some t < 1, or, by a hair, all but a multiple of the overlap.
     To round-off, 1e-12.
     """
 
@@ -321,7 +321,7 @@ def test_open_gaps_of_spheres_count_what_the_motion_ahead_leaves(kind):
     meets = beside & (after < -0.01) & (all_of_it > 1e-9)
     t = np.sqrt(np.maximum(bend, 0.0) / np.where(meets, all_of_it, 1.0))
     until = np.abs(gap + t * change + t**2 * all_of_it) < 1e-12
-    hair = np.abs(bend - (all_of_it + 4 * (after + 1e-4 * (gap + 0.1 + other[1])))) < 1e-12
+    hair = np.abs(bend - (all_of_it + FADING * (after + HAIR * (gap + 0.1 + other[1])))) < 1e-12
     assert (until | hair)[meets].all()
     assert (until & (t < 1))[meets].sum() > 10
 

@@ -207,7 +207,7 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
     total += 4 * (len(methods) + any(method.judges for method in methods))  # lists of environments
     for bundle, width in widths.items():
         for name, variable in bundle.vars.items():
-            if (name == "slip" and not law.is_cone) or (name == "jolt" and not model.bodies_meet):
+            if (name == "slip" and not law.is_cone) or (name in ("hit", "alert") and not model.bodies_meet):
                 continue
             if name in ("coefficient", "again"):  # for all alike
                 continue

@@ -216,8 +216,9 @@ class Model:
 
     @property
     def bodies_meet(self) -> bool:
-        """Can two bodies touch, not only a body and the world?"""
-        return bool((self.shape_body[self.pairs] >= 0).all(axis=-1).any())
+        """Can two free bodies touch?"""
+        free = np.r_[self.joint_type == JointType.FREE, False]  # the last one is the world, -1
+        return bool(free[self.shape_body[self.pairs]].all(axis=-1).any())
 
     @property
     def max_contacts(self) -> int:

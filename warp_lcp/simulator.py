@@ -354,7 +354,7 @@ class Simulator:
         self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
         self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
         for kernel, first, number in self._pair_kernels:
-            self.launch(kernel, [self.topology, self.bodies, first, h, self.slots], number)
+            self.launch(kernel, [*scene, self.bodies, first, h, self.slots], number)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
         if not self._methods[0].makes_rows:
@@ -481,7 +481,8 @@ class Simulator:
         bundle.pose, bundle.velocity = self._array(b, t.transform), self._array(b, t.spatial)
         bundle.com, bundle.inv_mass, bundle.inv_inertia = self._array(b, t.vec3), self._array(b, self.real), self._array(b, t.mat33)
         bundle.free_velocity = self._array(b, t.spatial)
-        bundle.jolt = self._array(b if m.bodies_meet else 0, self.real)
+        bundle.hit = self._array(b if m.bodies_meet else 0, self.real)
+        bundle.alert = wp.zeros(e if m.bodies_meet else 0, dtype=self.real, device=self.device)
         self.next_velocity = self._array(b, t.spatial)
 
         slots = self.slots = t.Slots()
