@@ -170,11 +170,14 @@ def run_stability(asked: argparse.Namespace) -> None:
         stability_picture.draw(rows, folder / "stability")
 
 
-def chart_rows(path: Path) -> list[dict[str, Any]]:
-    """What a chart's result holds."""
+def chart_data(path: Path) -> dict[str, Any]:
+    """A chart's result."""
     try:
-        return json.loads(path.read_text())["rows"]
-    except (OSError, ValueError, KeyError) as error:
+        data = json.loads(path.read_text())
+        if not isinstance(data["rows"], list):
+            raise ValueError("rows are no list")
+        return data
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise SystemExit(f"python -m benchmarks: error: {path} holds no data of a chart: {error}") from error
 
 
@@ -182,10 +185,14 @@ def run_chart(asked: argparse.Namespace) -> None:
     """Measured and kept after every case, unless data are given; told and drawn. Parts that are joined are kept as one."""
     device = wp.get_device(asked.device)
     if asked.data:
-        rows = [row for path in asked.data for row in chart_rows(path)]
-        complete = len(asked.data) > 1 and chart.complete(rows)
-        if len(asked.data) > 1:
-            keep(asked, device, {"rows": rows}, complete)
+        parts = [chart_data(path) for path in asked.data]
+        rows = [row for part in parts for row in part["rows"]]
+        if again := chart.twice(rows):
+            raise SystemExit(f"python -m benchmarks: error: {len(again)} points are in two of these files, the first: {again[0]}")
+        complete = chart.complete(rows)
+        if len(parts) > 1:
+            headers = [{name: value for name, value in part.items() if name != "rows"} for part in parts]
+            keep(asked, device, {"parts": headers, "rows": rows}, complete)
     else:
         names = asked.peers if asked.peers is not None else [] if asked.quick or device.is_cuda else list(peers.PEERS)
         if names and device.is_cuda:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import statistics
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -253,9 +254,17 @@ def measure(names: list[str], peers: list[Peer], folder: Path, device: Any, quic
 
 
 def complete(rows: list[dict[str, Any]]) -> bool:
-    """Is every charted case there, at every step and with every engine?"""
-    seen = {(row["case"], row["engine"], row["h"]) for row in rows}
-    return seen >= {(case, engine, h) for case in CHARTED for engine in ("warp_lcp", *PEERS) for h in STEPS}
+    """Is every charted case there, at every step and with every setting of every engine?"""
+    settings = [("warp_lcp", curve.name) for curve in OURS if not curve.directions]
+    settings += [(name, variant) for name, peer in PEERS.items() for variant in peer.variants]
+    seen = {(row["case"], row["engine"], row["setting"], row["h"]) for row in rows}
+    return seen >= {(case, *setting, h) for case in CHARTED for setting in settings for h in STEPS}
+
+
+def twice(rows: list[dict[str, Any]]) -> list[str]:
+    """Points that are there more than once."""
+    seen = Counter(", ".join(str(row[name]) for name in ("case", "engine", "setting", "knob")) for row in rows)
+    return [point for point, number in seen.items() if number > 1]
 
 
 def counts(row: dict[str, Any]) -> bool:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Performance profiles of the methods for LCPs on recorded problems, a panel a precision."""
+"""Performance profiles of the methods for LCPs on recorded problems, a panel a precision.
+
+A problem's time is that of its file's batch over the number of problems in it, so problems of a file differ by whether they are solved.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +31,9 @@ def draw(rows: list[dict[str, Any]], path: Path) -> list[Path]:
     for axis, (precision, tolerance) in zip(axes, lcp.TOLERANCE.items(), strict=True):
         table = lcp.times(rows, precision)
         profiles, number = profile(table), len(next(iter(table.values())))
-        panel(axis, profiles, number, 3.0 * max(ratios[-1] for ratios in profiles.values() if ratios), styles)
-        axis.set_title(f"{precision}, {number} problems solved to {tolerance:g}")
+        panel(axis, profiles, number, 3.0 * max((ratios[-1] for ratios in profiles.values() if ratios), default=1.0), styles)
+        axis.set_title(f"{precision}: which of {number} problems are solved to {tolerance:g}")
+        axis.set_xlabel("time / time of the fastest solver")
     axes[0].set_ylabel("share of problems solved")
     axes[-1].legend(loc="center left", bbox_to_anchor=(1.02, 0.5), frameon=False, handlelength=4.5)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -43,4 +43,3 @@ def panel(axis: Any, profiles: dict[str, list[float]], number: int, limit: float
     axis.set(xscale="log", xlim=(1.0, limit), ylim=(0.0, 1.03))
     axis.grid(True, which="major", color="0.88", linewidth=0.6)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.set_xlabel("time / time of the fastest solver")

@@ -220,7 +220,7 @@ def make(real) -> dict:
             along = motion.shift + carried  # of p relative to com_a
             around = wp.cross(motion.turn_a, p - motion.com_a)
             left = bend(gap, distance, n, along - around, motion.distance, motion.normal)
-            # Not another point of the segment that comes nearer, which has a row of its own: what turning takes from this one.
+            # Another point of the segment may come nearer than this one; only what turning takes from this one counts here.
             curl = wp.cross(motion.turn_b, carried) - real(2.0) * wp.cross(motion.turn_a, along) + wp.cross(motion.turn_a, around)
             left = wp.max(left, wp.min(real(0.5) * wp.dot(n, curl), real(0.0)))
             write_bent(slots, env, slot, p - n * (radius + real(0.5) * gap), n, gap, left, feature)

@@ -102,7 +102,7 @@ def make(real) -> SimpleNamespace:
                             arm = contacts.point[env, i] - com
                             allowed += rounding * wp.length(com) / h
                             closing += real(1 - 2 * side) * wp.dot(n, point_velocity(extra, arm))
-                    speed_to_close = contacts.shift[env, i][0]  # of an open gap: (phi + bend) / h
+                    speed_to_close = contacts.shift[env, i][0]  # of an open gap, with what bends it
                     if contacts.closed[env, i] != 0:
                         speed_to_close = contacts.gap[env, i] / h
                     allowed += wp.max(speed_to_close + contacts.velocity[env, i][0], real(0.0))

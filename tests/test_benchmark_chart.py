@@ -299,27 +299,28 @@ def test_parts_of_a_chart_are_joined(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
     monkeypatch.setattr(report, "PARTIAL", tmp_path / "parts")
     monkeypatch.setattr(chart_picture, "draw", lambda *_: [])
-    engines = ("warp_lcp", *peers.PEERS)
-    rows = [point(engine, h=h, case=case, versions={}) for case in chart.CHARTED for engine in engines for h in chart.STEPS]
+    settings = [("warp_lcp", curve.name) for curve in chart.OURS]
+    settings += [(name, variant) for name, peer in peers.PEERS.items() for variant in peer.variants]
+    rows = [point(*setting, h=h, case=case, versions={}) for case in chart.CHARTED for setting in settings for h in chart.STEPS]
     assert chart.complete(rows)
-    assert not chart.complete([row for row in rows if row["engine"] != "drake"])
+    assert not chart.complete([row for row in rows if row["setting"] != "lagged"])
+    assert not chart.complete([row for row in rows if row["h"] != 5e-4 or row["setting"] != "midpoint"])
 
     def join(first: list[dict], second: list[dict]) -> list[dict]:
         files = [tmp_path / "a.json", tmp_path / "b.json"]
         for file, part in zip(files, (first, second), strict=True):
-            file.write_text(json.dumps({"rows": part}))
+            file.write_text(json.dumps({"device": file.stem, "rows": part}))
         monkeypatch.setattr(sys, "argv", ["benchmarks", "chart", "--data", *map(str, files), "--docs", str(tmp_path / "docs")])
         command.main()
         (kept,) = (tmp_path / ("results" if len(first + second) == len(rows) else "parts")).glob("*-chart-cpu.json")
-        return json.loads(kept.read_text())["rows"]
+        data = json.loads(kept.read_text())
+        assert [part["device"] for part in data["parts"]] == ["a", "b"]
+        return data["rows"]
 
     assert join(rows[:5], rows[5:]) == rows
     assert join(rows[:5], rows[9:]) == rows[:5] + rows[9:]
-
-
-def last(what: str) -> dict:
-    """The result that is kept."""
-    return json.loads(sorted((ROOT / "benchmarks" / "results").glob(f"*-{what}-cpu.json"))[-1].read_text())
+    with pytest.raises(SystemExit, match=r"1 points are in two of these files, the first: box, warp_lcp, default, 0\.1 ms"):
+        join(rows[:7], rows[6:])
 
 
 TABLES = {
@@ -329,17 +330,28 @@ TABLES = {
 }
 
 
+def kept(what: str) -> dict | None:
+    """The result that was kept last."""
+    files = sorted((ROOT / "benchmarks" / "results").glob(f"*-{what}-cpu.json"))
+    return json.loads(files[-1].read_text()) if files else None
+
+
 @pytest.mark.parametrize("what", TABLES)
 def test_the_document_holds_the_tables_of_the_results(what):
-    assert report.tables(what, ROOT / "docs" / f"{what}.md") == TABLES[what](last(what))
+    """And none where none are kept."""
+    data = kept(what)
+    assert report.tables(what, ROOT / "docs" / f"{what}.md") == (TABLES[what](data) if data else "")
 
 
 @pytest.mark.parametrize(("name", "key"), [("chart", "error"), ("chart_energy", "E_uc")])
 def test_the_pictures_hold_the_points_of_the_results(name, key):
-    """All of them and no other, by their titles."""
-    rows = [row for row in last("chart")["rows"] if chart.counts(row) and row.get(key) is not None]
-    titles = [element.text for element in ElementTree.parse(ROOT / "docs" / f"{name}.svg").iter(f"{{{pictures.SVG}}}title")]
-    assert sorted(titles) == sorted(chart_picture.title(row) for row in rows)
+    """All of them and no other, by their titles; there is none where none are kept."""
+    data, picture = kept("chart"), ROOT / "docs" / f"{name}.svg"
+    assert picture.exists() == (data is not None)
+    if data is not None:
+        rows = [row for row in data["rows"] if chart.counts(row) and row.get(key) is not None]
+        titles = [element.text for element in ElementTree.parse(picture).iter(f"{{{pictures.SVG}}}title")]
+        assert sorted(titles) == sorted(chart_picture.title(row) for row in rows)
 
 
 def test_cases_that_are_taken_without_being_named():

@@ -44,6 +44,8 @@ def draw(rows: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
         line[-1].legend(loc="center left", bbox_to_anchor=(1.02, 0.5), frameon=False, handlelength=4.5)
     for axis, tolerance in zip(axes[0], summary.TOLERANCES, strict=True):
         axis.set_title(f"natural map $\\leq$ $10^{{{round(math.log10(tolerance))}}}$")
+    for axis in axes[-1]:
+        axis.set_xlabel("time / time of the fastest solver")
     folder.mkdir(parents=True, exist_ok=True)
     paths = save(figure, folder / "friction_profile")
     plt.close(figure)
