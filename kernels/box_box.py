@@ -139,7 +139,7 @@ def make(real):
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, a, p = pair_functions(real), axes(real), polygon(real)
     shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
-    sum_norm, far_apart, set_apart = f.sum_norm, f.far_apart, f.set_apart
+    far_apart, set_apart = f.far_apart, f.set_apart
     face_separation, edge_axis, edge_separation, column, rank = a.face_separation, a.edge_axis, a.edge_separation, a.column, a.rank
     Polygon, clip = p.Polygon, p.clip
 
@@ -344,11 +344,11 @@ def make(real):
             pair = first + index
             sa = topology.pairs[pair, 0]
             sb = topology.pairs[pair, 1]
-            ha = topology.shape_size[sa]
-            hb = topology.shape_size[sb]
-            if far_apart(topology, bodies, env, sa, sb, sum_norm(ha), sum_norm(hb), h):
+            if far_apart(bodies, env, sa, sb):
                 set_apart(topology, slots, env, pair)
                 continue
+            ha = topology.shape_size[sa]
+            hb = topology.shape_size[sb]
             xa = shape_pose(topology, bodies, env, sa)
             xb = shape_pose(topology, bodies, env, sb)
             ca = wp.transform_get_translation(xa)

@@ -247,12 +247,12 @@ def make(real) -> dict:
             pair = first + i
             sa = topology.pairs[pair, 0]
             sb = topology.pairs[pair, 1]
+            if far_apart(bodies, env, sa, sb):
+                set_apart(topology, slots, env, pair)
+                continue
             ra = topology.shape_size[sa][0]
             rb = topology.shape_size[sb][0]
             half = topology.shape_size[sb][1]
-            if far_apart(topology, bodies, env, sa, sb, ra, half + rb, h):
-                set_apart(topology, slots, env, pair)
-                continue
             centre = wp.transform_get_translation(shape_pose(topology, bodies, env, sa))
             capsule = shape_pose(topology, bodies, env, sb)
             axis = z_axis(capsule)
@@ -393,6 +393,9 @@ def make(real) -> dict:
             pair = first + i
             sa = topology.pairs[pair, 0]
             sb = topology.pairs[pair, 1]
+            if far_apart(bodies, env, sa, sb):
+                set_apart(topology, slots, env, pair)
+                continue
             box = shape_pose(topology, bodies, env, sa)
             capsule = shape_pose(topology, bodies, env, sb)
             size = topology.shape_size[sa]
@@ -433,6 +436,9 @@ def make(real) -> dict:
             pair = first + i
             sa = topology.pairs[pair, 0]
             sb = topology.pairs[pair, 1]
+            if far_apart(bodies, env, sa, sb):
+                set_apart(topology, slots, env, pair)
+                continue
             a = shape_pose(topology, bodies, env, sa)
             b = shape_pose(topology, bodies, env, sb)
             ra = topology.shape_size[sa][0]

@@ -28,7 +28,7 @@ FADING = wp.constant(4.0)
 def pair_functions(real) -> SimpleNamespace:
     """Functions that every pair kernel uses."""
     t = scalar_types(real)
-    vec3, quat, transform = t.vec3, t.quat, t.transform
+    vec3, vec4, quat, transform = t.vec3, t.vec4, t.quat, t.transform
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
 
     @wp.func
@@ -58,27 +58,33 @@ def pair_functions(real) -> SimpleNamespace:
         return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
 
     @wp.func
-    def widest_reach(topology: Topology, bodies: Bodies, env: int, shape: int, radius: real, h: real):
-        """Centre of a shape, and at least radius + ``reach``, without a root."""
-        centre = wp.transform_get_translation(topology.shape_pose[shape])
-        far = real(1.02) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
-        body = topology.shape_body[shape]
-        if body >= 0:
-            centre = wp.transform_point(bodies.pose[env, body], centre)
-            twist = bodies.free_velocity[env, body]
-            lever = radius + sum_norm(centre - bodies.com[env, body])
-            far += real(2.0) * h * (sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
-            if bodies.alert.shape[0] > 0:
-                far += real(2.0) * h * bodies.alert[env]
-        return centre, far
+    def far_apart(bodies: Bodies, env: int, a: int, b: int) -> bool:
+        """Are two shapes further apart than ``reach`` allows for, by their bounds? Not all that are are found."""
+        ball_a = bodies.bounds[env, a]
+        ball_b = bodies.bounds[env, b]
+        d = vec3(ball_b[0] - ball_a[0], ball_b[1] - ball_a[1], ball_b[2] - ball_a[2])
+        far = ball_a[3] + ball_b[3]
+        return wp.length_sq(d) >= far * far
 
-    @wp.func
-    def far_apart(topology: Topology, bodies: Bodies, env: int, a: int, b: int, ra: real, rb: real, h: real) -> bool:
-        """Are two shapes further apart than ``reach`` allows for, by a test without roots? Not all that are are found."""
-        ca, far_a = widest_reach(topology, bodies, env, a, ra, h)
-        cb, far_b = widest_reach(topology, bodies, env, b, rb, h)
-        far = far_a + far_b
-        return wp.length_sq(cb - ca) >= far * far
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def bounds(topology: Topology, bodies: Bodies, h: real, stride: int):
+        """Centre of every shape, and at least its radius + ``reach``, without a root; of the world's once."""
+        start, shape = wp.tid()
+        for env in range(start, bodies.bounds.shape[0], stride):
+            body = topology.shape_body[shape]
+            if body < 0 and bodies.bounds[env, shape][3] > real(0.0):
+                continue
+            radius = sum_norm(topology.shape_size[shape])
+            centre = wp.transform_get_translation(topology.shape_pose[shape])
+            far = real(1.02) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
+            if body >= 0:
+                centre = wp.transform_point(bodies.pose[env, body], centre)
+                twist = bodies.free_velocity[env, body]
+                lever = radius + sum_norm(centre - bodies.com[env, body])
+                far += real(2.0) * h * (sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
+                if bodies.alert.shape[0] > 0:
+                    far += real(2.0) * h * bodies.alert[env]
+            bodies.bounds[env, shape] = vec4(centre[0], centre[1], centre[2], far)
 
     @wp.func
     def set_apart(topology: Topology, slots: Slots, env: int, pair: int):
@@ -180,6 +186,7 @@ def pair_functions(real) -> SimpleNamespace:
         reach=reach,
         sum_norm=sum_norm,
         far_apart=far_apart,
+        bounds=bounds,
         set_apart=set_apart,
         shape_velocity=shape_velocity,
         shape_turn=shape_turn,
@@ -203,7 +210,7 @@ def make(real) -> dict:
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f = pair_functions(real)
     shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
-    far_apart, set_apart, sum_norm = f.far_apart, f.set_apart, f.sum_norm
+    far_apart, set_apart = f.far_apart, f.set_apart
     outside_box, bend, shape_turn, rotation, shift = f.outside_box, f.bend, f.shape_turn, f.rotation, f.shift
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
@@ -255,11 +262,11 @@ def make(real) -> dict:
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
-            ra = topology.shape_size[topology.pairs[pair, 0]][0]
-            rb = topology.shape_size[topology.pairs[pair, 1]][0]
-            if far_apart(topology, bodies, env, topology.pairs[pair, 0], topology.pairs[pair, 1], ra, rb, h):
+            if far_apart(bodies, env, topology.pairs[pair, 0], topology.pairs[pair, 1]):
                 set_apart(topology, slots, env, pair)
                 continue
+            ra = topology.shape_size[topology.pairs[pair, 0]][0]
+            rb = topology.shape_size[topology.pairs[pair, 1]][0]
             a = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
             b = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
             offset = b - a
@@ -280,11 +287,11 @@ def make(real) -> dict:
         start, i = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + i
-            radius = topology.shape_size[topology.pairs[pair, 0]][0]
-            size = topology.shape_size[topology.pairs[pair, 1]]
-            if far_apart(topology, bodies, env, topology.pairs[pair, 0], topology.pairs[pair, 1], radius, sum_norm(size), h):
+            if far_apart(bodies, env, topology.pairs[pair, 0], topology.pairs[pair, 1]):
                 set_apart(topology, slots, env, pair)
                 continue
+            radius = topology.shape_size[topology.pairs[pair, 0]][0]
+            size = topology.shape_size[topology.pairs[pair, 1]]
             centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
             box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
             local = wp.transform_point(wp.transform_inverse(box), centre)

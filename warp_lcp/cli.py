@@ -211,7 +211,8 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
                 continue
             if name in ("coefficient", "again"):  # for all alike
                 continue
-            total += wp.types.type_size_in_bytes(variable.type.dtype) * (1 if variable.type.ndim == 1 else width)
+            number = (len(model.shape_body) if model.bounded else 0) if name == "bounds" else 1 if variable.type.ndim == 1 else width
+            total += wp.types.type_size_in_bytes(variable.type.dtype) * number
     return total
 
 

@@ -215,6 +215,11 @@ class Model:
         return bool(self.restitution[self.pairs].any())
 
     @property
+    def bounded(self) -> bool:
+        """Can two shapes touch that both have an end? Before such pairs are looked at they are told apart by their bounds."""
+        return bool((self.shape_type[self.pairs] != ShapeType.PLANE).all(axis=-1).any())
+
+    @property
     def bodies_meet(self) -> bool:
         """Can two free bodies touch?"""
         free = np.r_[self.joint_type == JointType.FREE, False]  # the last one is the world, -1

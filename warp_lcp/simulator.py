@@ -353,6 +353,8 @@ class Simulator:
         k, h, b, scene = self._kernels, self.dt, self.model.num_bodies, [self.topology, self.parameters]
         self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
         self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
+        if self.model.bounded:
+            self.launch(k.bounds, [self.topology, self.bodies, h], len(self.model.shape_body))
         for kernel, first, number in self._pair_kernels:
             self.launch(kernel, [*scene, self.bodies, first, h, self.slots], number)
         self.reason.zero_()
@@ -481,6 +483,7 @@ class Simulator:
         bundle.pose, bundle.velocity = self._array(b, t.transform), self._array(b, t.spatial)
         bundle.com, bundle.inv_mass, bundle.inv_inertia = self._array(b, t.vec3), self._array(b, self.real), self._array(b, t.mat33)
         bundle.free_velocity = self._array(b, t.spatial)
+        bundle.bounds = self._array(len(m.shape_body) if m.bounded else 0, t.vec4)
         bundle.hit = self._array(b if m.bodies_meet else 0, self.real)
         bundle.alert = wp.zeros(e if m.bodies_meet else 0, dtype=self.real, device=self.device)
         self.next_velocity = self._array(b, t.spatial)
@@ -553,6 +556,8 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         certify=certify.make(real),
         reset=reset.make(real),
     )
+    if model.bounded:
+        stages.bounds = collide.pair_functions(real).bounds
     if not without_rows:
         stages.contact_rows = rows.contact_rows
     if model.bounces:
