@@ -19,7 +19,7 @@ FAR_PAIR = wp.constant(2.0e30)
 # Cosine: directions from faces of a box that are square to each other, rotated to world axes, agree by less than this.
 SQUARE = wp.constant(1.0e-6)
 # Of the distance: shapes that overlap by less ahead do not meet, as what rests on both and sinks in does not.
-HAIR = wp.constant(1.0e-3)
+HAIR = wp.constant(1.0e-2)
 # How many times what they overlap by beyond that is taken from what is bent, which so fades out.
 FADING = wp.constant(4.0)
 

@@ -320,6 +320,21 @@ def test_a_sphere_rolls_over_seams(h, loss):
     assert 1 - sim.v.numpy()[0, 0] / 2.1 < loss
 
 
+@pytest.mark.parametrize(("h", "loss", "hop"), [(5e-3, 0.07, 0.9e-3), (1e-2, 0.09, 1.3e-3)])
+def test_a_soft_sphere_rolls_over_seams(h, loss, hop):
+    """Sunk in by 1 mm it meets the edge ahead by a hair, which is no obstacle. Exact: no loss; found 6.9 and 8.7 %, twice that if it were."""
+    stiffness = G / 1e-3
+    builder, material = wl.ModelBuilder(), wl.Material(0.5, 0.5, stiffness, 0.01 * stiffness)
+    tiles(builder, material)
+    body = builder.add_body(pose=(-0.5, 0, 0.099, 0, 0, 0, 1), velocity=(2.1, 0, 0), angular_velocity=(0, 21, 0), mass=1.0)
+    builder.add_sphere(body, 0.1, material=material)
+    sim = simulator(builder, dt=h)
+    for _ in range(round(1.0 / h)):
+        sim.step()
+        assert sim.q.numpy()[0, 2] - 0.099 < hop
+    assert 1 - sim.v.numpy()[0, 0] / 2.1 < loss
+
+
 @pytest.mark.parametrize("h", [1e-3, 5e-3, 1e-2])
 @pytest.mark.parametrize("gap", [1e-4, 1e-3, 5e-3, 2e-2])
 @pytest.mark.parametrize("kind", ["sphere", "capsule", "box"])
