@@ -184,7 +184,6 @@ def pair_functions(real) -> SimpleNamespace:
     return SimpleNamespace(
         shape_pose=shape_pose,
         reach=reach,
-        sum_norm=sum_norm,
         far_apart=far_apart,
         bounds=bounds,
         set_apart=set_apart,

@@ -12,7 +12,7 @@ from .types import OPTIONS, scalar_types
 def make(real):
     """Kernel ``reset``; launch with dim (E)."""
     t = scalar_types(real)
-    Contacts, Slots = t.Contacts, t.Slots
+    Bodies, Contacts, Slots = t.Bodies, t.Contacts, t.Slots
     spatial = t.spatial
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
@@ -23,6 +23,7 @@ def make(real):
         q: wp.array2d(dtype=real),
         v: wp.array2d(dtype=real),
         wrench: wp.array2d(dtype=spatial),
+        bodies: Bodies,
         contacts: Contacts,
         slots: Slots,
         residual: wp.array(dtype=real),
@@ -39,6 +40,8 @@ def make(real):
             v[env, i] = v0[env, i]
         for b in range(wrench.shape[1]):
             wrench[env, b] = spatial()
+        if bodies.alert.shape[0] > 0:
+            bodies.alert[env] = real(0.0)
         for slot in range(slots.last_feature.shape[1]):
             slots.last_feature[env, slot] = -1
         contacts.count[env] = 0

@@ -213,7 +213,7 @@ class Simulator:
             mask = wp.array(mask, dtype=wp.bool, device=self.device)
         elif mask.shape != (self.num_envs,) or mask.dtype is not wp.bool:
             raise WarpLcpError(f"reset: mask is {mask.shape} of {mask.dtype.__name__}; give ({self.num_envs},) of wp.bool")
-        inputs = [mask, self.q0, self.v0, self.q, self.v, self.wrench, self.rows, self.slots]
+        inputs = [mask, self.q0, self.v0, self.q, self.v, self.wrench, self.bodies, self.rows, self.slots]
         inputs += [self.residual, self.residual_energy, self.iterations, self.status]
         wp.launch(self._kernels.reset, dim=self.num_envs, inputs=inputs, device=self.device)
 
