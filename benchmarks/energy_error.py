@@ -67,8 +67,15 @@ class Step:
 
         by_momentum = np.linalg.lstsq(effect, missing, rcond=None)[0]
         scale = np.repeat(m_n, 3) * max(np.abs(self.after).max(), np.abs(self.free).max(), 1e-9)
-        starts = (self.start, by_momentum)
-        return float(min(2.0 * least_squares(laws, x, x_scale=scale, max_nfev=60, ftol=1e-12, xtol=1e-12, gtol=None).cost for x in starts))
+
+        def search(start: np.ndarray) -> float:
+            asked = {"x_scale": scale, "ftol": 1e-12, "xtol": 1e-12}
+            try:
+                return 2.0 * least_squares(laws, start, max_nfev=60, gtol=None, **asked).cost
+            except np.linalg.LinAlgError:  # LAPACK's SVD gives up on some finite matrices; this method has none, but takes longer
+                return 2.0 * least_squares(laws, start, method="lm", max_nfev=15 * (len(start) + 1), **asked).cost
+
+        return float(min(search(self.start), search(by_momentum)))
 
 
 def steps(moved: Motion) -> list[Step]:
