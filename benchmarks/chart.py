@@ -138,7 +138,28 @@ def turn(clock: Clock) -> float:
     return statistics.median(seconds)
 
 
-def ours_at(case: Case, h: float, device: Any) -> tuple[list[dict[str, Any]], list[Clock]]:
+def clock_of(case: Case, h: float, device: Any, options: dict[str, Any]) -> tuple[Clock, Scene]:
+    """What times a batch of ours once, and the batch: fewer environments where a turn would take too long, as for other engines."""
+
+    def of(scene: Scene) -> Clock:
+        sim = scene.simulator(device=device, **options)
+
+        def clock() -> float:
+            scene.restart(sim)
+            begin = time.perf_counter()
+            sim.step(scene.steps)
+            wp.synchronize_device(sim.device)
+            return time.perf_counter() - begin
+
+        clock()  # warm
+        return clock
+
+    few = part(case, h).copies(LEAST_ENVS)
+    scene = part(case, h, of(few)() / (few.envs * few.steps))
+    return of(scene), scene
+
+
+def ours_at(case: Case, h: float, device: Any) -> tuple[list[dict[str, Any]], list[tuple[Clock, Scene]]]:
     """Our points at a step, and what times each of them once."""
     points, clocks = [], []
     for curve in OURS:
@@ -147,25 +168,14 @@ def ours_at(case: Case, h: float, device: Any) -> tuple[list[dict[str, Any]], li
         for k in curve.directions or (None,):
             options = curve.options | ({} if k is None else {"directions": k})
             knob = f"{1e3 * h:g} ms" if k is None else f"k = {k}"
-            scene = part(case, h)
             try:
                 moved = case.simulate(h, device=device, limit=PATIENCE, **options)
             except motion.TooSlow as why:
                 points.append({"case": case.name, "engine": "warp_lcp", "setting": curve.name, "knob": knob, "h": h, "left_out": str(why)})
                 continue
             points.append(point(case, moved, "warp_lcp", curve.name, knob, h))
-            points[-1] |= energy_errors(motion.simulate(scene.copies(1), device=device, **options))
-            sim = scene.simulator(device=device, **options)
-
-            def clock(sim=sim, scene=scene) -> float:
-                scene.restart(sim)
-                begin = time.perf_counter()
-                sim.step(scene.steps)
-                wp.synchronize_device(sim.device)
-                return time.perf_counter() - begin
-
-            clock()  # warm
-            clocks.append(clock)
+            points[-1] |= energy_errors(motion.simulate(part(case, h).copies(1), device=device, **options))
+            clocks.append(clock_of(case, h, device, options))
     return points, clocks
 
 
@@ -211,7 +221,7 @@ def at(case: Case, h: float, sessions: list[Session], known: dict[tuple[str, str
     theirs, tasks = theirs_at(case, h, sessions, known)
     seconds: list[list[float]] = [[] for _ in clocks]
     for _ in range(TURNS):
-        for clock, into in zip(clocks, seconds, strict=True):
+        for (clock, _), into in zip(clocks, seconds, strict=True):
             into.append(turn(clock))
         for i, (row, task) in enumerate(zip(theirs, tasks, strict=True)):
             if task is not None:
@@ -221,10 +231,11 @@ def at(case: Case, h: float, sessions: list[Session], known: dict[tuple[str, str
                     if task[0].session.process.poll() is not None:
                         raise
                     row["left_out"], tasks[i] = str(why).strip().splitlines()[-1], None
-    scene, measured = part(case, h), iter(seconds)
+    measured = zip(seconds, clocks, strict=True)
     for row in mine:
         if "left_out" not in row:
-            row |= spread(next(measured), scene)
+            each, (_, scene) = next(measured)
+            row |= spread(each, scene)
     for row, task in zip(theirs, tasks, strict=True):
         if task is not None:
             done, short = task
