@@ -77,8 +77,8 @@ def _rho(scale: float) -> Variant:
 
 SINGLE = "float32: velocities are certified near their resolution, and Table 1's stiffness is beyond it"
 VARIANTS = (
-    Variant("default"),
-    Variant("coulomb", {"formulation": "coulomb"}),
+    Variant("default", cause="what a step of that length does not resolve"),
+    Variant("coulomb", {"formulation": "coulomb"}, cause="what a step of that length does not resolve"),
     Variant("midpoint", {"integrator": "midpoint"}, cause="positions of second order after an impact depend on when in the step it was"),
     Variant("aligned", {"sliding": "aligned"}, cause="friction keeps the direction that the slip had before the step"),
     *(
