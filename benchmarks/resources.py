@@ -18,7 +18,7 @@ import warp as wp
 from warp_lcp.kernels import contact_problem, lcp, record, solve_batch, watch
 
 import warp_lcp as wl
-from warp_lcp.methods import METHODS
+from warp_lcp.methods import LCP_METHODS, METHODS
 from warp_lcp.simulator import PRECISIONS
 
 ARCHITECTURE = 90
@@ -37,7 +37,7 @@ class Resources:
 
 
 def scenes() -> list[wl.Model]:
-    """A scene with one movable body, the same with restitution, and one in which every pair of shapes can meet."""
+    """A scene with one movable body, the same with restitution, one in which every pair of shapes can meet, and one with joints."""
     made = []
     for e in (0.0, 0.5):
         single = wl.ModelBuilder()
@@ -50,7 +50,14 @@ def scenes() -> list[wl.Model]:
         many.add_box(many.add_body(), (0.1, 0.1, 0.1))
         many.add_sphere(many.add_body(), 0.1)
         many.add_capsule(many.add_body(), 0.1, 0.1)
-    return [*made, many.finalize()]
+    joints = wl.ModelBuilder()
+    joints.add_plane(material=wl.Material(restitution=0.5))
+    joints.add_box(joints.add_body(), (0.1, 0.1, 0.1))
+    link = joints.add_body(pose=(0.5, 0, 0, 0, 0, 0, 1))
+    joints.add_box(link, (0.1, 0.1, 0.1))
+    joints.add_joint(wl.JointType.REVOLUTE, 0, link, limit=(-1.0, 1.0))
+    joints.add_joint(wl.JointType.SPHERICAL, -1, link, loop=True)
+    return [*made, many.finalize(), joints.finalize()]
 
 
 def kernels(precision: str) -> dict[str, wp.Kernel]:
@@ -62,11 +69,16 @@ def kernels(precision: str) -> dict[str, wp.Kernel]:
     found |= {f"assembled_lcp[{method}]": lcp.make(real, method) for method in ("lemke", "murty", "judice_pires")}
     generators = ("lemke", "murty", "judice_pires")
     found |= {f"assembled_lcp[{method}, anitescu_potra]": lcp.make(real, method, True) for method in generators}
+    found |= {f"assembled_lcp[{method}, joints]": lcp.make(real, method, False, True) for method in generators}
     for model in scenes():
-        bounces = "restitution" if model.bounces else ""
+        bounces = "joints" if model.articulated else "restitution" if model.bounces else ""
         options = [{"method": m} for m in METHODS if precision == "float64" or m != "velocity_pivoting"]
         laws = [{"formulation": law} for law in ("coulomb", "hybrid")]
-        for option in (*options, {"method": "pgs", "integrator": "midpoint"}, *laws):
+        if model.articulated:
+            options = [option for option in options if option["method"] not in LCP_METHODS]
+        else:
+            options.append({"method": "pgs", "integrator": "midpoint"})
+        for option in (*options, *laws):
             for kernel in wl.Simulator(model, precision=precision, device="cpu", **option).kernels:
                 if kernel not in found.values():
                     name, what = kernel.key.split("__")[-1], ", ".join(filter(None, (option.get("formulation"), bounces)))

@@ -17,19 +17,19 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import friction, rigid
-from .types import NOT_A_NUMBER, OPEN, OPTIONS, SLIDE, STICK, UNCERTIFIED, scalar_types
+from . import friction, rigid, tree
+from .types import HELD, NOT_A_NUMBER, OPEN, OPTIONS, SLIDE, STICK, UNCERTIFIED, scalar_types
 
 # Residual of an answer that is not a number.
 HUGE = wp.constant(1.0e30)
 
 
 @functools.cache
-def functions(real) -> SimpleNamespace:
+def functions(real, joints: bool = False) -> SimpleNamespace:
     """``judge`` and ``remember`` of one contact."""
     t = scalar_types(real)
     vec2, vec3, mat33, Slots = t.vec2, t.vec3, t.mat33, t.Slots
-    law = friction.functions(real)
+    law = friction.functions(real, joints)
     project_friction, weigh, law_error = law.project_friction, law.weigh, law.law_error
 
     @wp.func
@@ -42,6 +42,9 @@ def functions(real) -> SimpleNamespace:
             inside = project_friction(pressed, mu * p[0] + bound, k) - pressed
             if k == 0 or wp.dot(inside, inside) > real(0.0):
                 state = SLIDE
+        if wp.static(joints):  # noqa: SIM102
+            if k == HELD:
+                state = STICK
         return state
 
     @wp.func
@@ -70,21 +73,24 @@ def functions(real) -> SimpleNamespace:
 
 
 @functools.cache
-def make(real):
-    """Kernel ``certify``; launch with dim (E)."""
+def make(real, trees: bool = False):
+    """Kernel ``certify``; launch with dim (E). trees: for scenes with joints."""
     t = scalar_types(real)
     vec3, spatial = t.vec3, t.spatial
     Bodies, Contacts, Slots = t.Bodies, t.Contacts, t.Slots
-    law = friction.functions(real)
+    law = friction.functions(real, trees)
     weigh, law_error = law.weigh, law.law_error
-    f = functions(real)
+    f = functions(real, trees)
     judge, remember = f.judge, f.remember
     body = rigid.functions(real)
     point_velocity, wrench, response = body.point_velocity, body.wrench, body.response
+    forest = tree.functions(real)
+    respond, push_joint, joint_velocity = forest.respond, forest.push_joint, forest.joint_velocity
+    Mechanics = forest.Trees if trees else Bodies
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def certify(
-        bodies: Bodies,
+        bodies: Mechanics,
         h: real,
         tolerance: real,
         attempt: int,
@@ -120,15 +126,27 @@ def make(real):
                 # The wrench of all impulses on each body, then what it changes: next_velocity holds v+ - v_free until the end.
                 for b in range(next_velocity.shape[1]):
                     next_velocity[env, b] = spatial()
+                if wp.static(trees):
+                    for i in range(bodies.change.shape[1]):
+                        bodies.change[env, i] = real(0.0)
                 for i in range(r):
                     impulse = wp.transpose(contacts.frame[env, i]) * contacts.impulse[env, i]
-                    for side in range(2):
-                        b = contacts.body[env, i][side]
-                        if b >= 0:
-                            arm = contacts.point[env, i] - bodies.com[env, b]
-                            next_velocity[env, b] += real(2 * side - 1) * wrench(arm, impulse)
-                for b in range(next_velocity.shape[1]):
-                    next_velocity[env, b] = response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], next_velocity[env, b])
+                    sides = int(2)
+                    if wp.static(trees):  # noqa: SIM102
+                        if contacts.slot[env, i] < 0:
+                            sides = 0
+                            push_joint(bodies, next_velocity, env, -1 - contacts.slot[env, i], contacts.point[env, i], impulse)
+                    if sides > 0:
+                        for side in range(2):
+                            b = contacts.body[env, i][side]
+                            if b >= 0:
+                                arm = contacts.point[env, i] - bodies.com[env, b]
+                                next_velocity[env, b] += real(2 * side - 1) * wrench(arm, impulse)
+                if wp.static(trees):
+                    respond(bodies, next_velocity, env)
+                else:
+                    for b in range(next_velocity.shape[1]):
+                        next_velocity[env, b] = response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], next_velocity[env, b])
 
                 worst = real(0.0)
                 energy = real(0.0)
@@ -136,11 +154,17 @@ def make(real):
                 for i in range(r):
                     p = contacts.impulse[env, i]
                     du = vec3()
-                    for side in range(2):
-                        b = contacts.body[env, i][side]
-                        if b >= 0:
-                            arm = contacts.point[env, i] - bodies.com[env, b]
-                            du += real(2 * side - 1) * point_velocity(next_velocity[env, b], arm)
+                    sides = int(2)
+                    if wp.static(trees):  # noqa: SIM102
+                        if contacts.slot[env, i] < 0:
+                            sides = 0
+                            du = joint_velocity(bodies, next_velocity, env, -1 - contacts.slot[env, i], contacts.point[env, i])
+                    if sides > 0:
+                        for side in range(2):
+                            b = contacts.body[env, i][side]
+                            if b >= 0:
+                                arm = contacts.point[env, i] - bodies.com[env, b]
+                                du += real(2 * side - 1) * point_velocity(next_velocity[env, b], arm)
                     u = contacts.free[env, i] + contacts.frame[env, i] * du
                     error, part, ended, state = judge(
                         u,
@@ -199,6 +223,9 @@ def make(real):
 
             if solved or final != 0:
                 for i in range(r):
+                    if wp.static(trees):  # noqa: SIM102
+                        if contacts.slot[env, i] < 0:
+                            continue
                     remember(
                         slots,
                         env,

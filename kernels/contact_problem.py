@@ -5,7 +5,7 @@ import functools
 
 import warp as wp
 
-from . import friction, proximal, rigid
+from . import friction, proximal, rigid, tree
 from .types import BLOCK_OPTIONS, DISC, ITERATION_LIMIT, NOT_A_NUMBER, UNCERTIFIED, scalar_types, sync
 
 
@@ -190,16 +190,34 @@ def make(real):
 
 
 @functools.cache
-def make_contacts(real):
-    """Kernel ``proximal_contacts`` for the rows of environments; launch tiled with dim (P)."""
+def make_contacts(real, trees: bool = False):
+    """Kernel ``proximal_contacts`` for the rows of environments; launch tiled with dim (P). trees: for scenes with joints."""
     t = scalar_types(real)
-    vec3 = t.vec3
+    vec3, mat33 = t.vec3, t.mat33
     Bodies, Contacts = t.Bodies, t.Contacts
-    f = proximal.functions(real)
+    f = proximal.functions(real, trees)
     Graph, ContactProblem = f.Graph, f.ContactProblem
     clear, connect, analyse, proximal_newton = f.clear, f.connect, f.analyse, f.proximal_newton
-    weigh = friction.functions(real).weigh
+    weigh = friction.functions(real, trees).weigh
     delassus = rigid.functions(real).delassus
+    forest = tree.functions(real)
+    product, Mechanics = forest.product, forest.Trees if trees else Bodies
+
+    @wp.func
+    def couple_trees(g: Graph, slot: int, n: int, body: wp.array2d(dtype=wp.vec2i), shared: wp.array2d(dtype=int), env: int, lane: int):
+        """Contacts whose bodies have velocities in common are neighbours."""
+        for i in range(lane, n, wp.block_dim()):
+            clear(g, slot, n, i)
+            for j in range(n):
+                if j != i:
+                    for x in range(2):
+                        for y in range(2):
+                            a = body[env, i][x]
+                            b = body[env, j][y]
+                            if a >= 0 and b >= 0:  # noqa: SIM102
+                                if shared[a, b] > 0:
+                                    connect(g, slot, i, j)
+        sync()
 
     @wp.func
     def couple(g: Graph, slot: int, n: int, body: wp.array2d(dtype=wp.vec2i), inv_mass: wp.array2d(dtype=real), env: int, lane: int):
@@ -217,7 +235,7 @@ def make_contacts(real):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def proximal_contacts(
-        bodies: Bodies,
+        bodies: Mechanics,
         contacts: Contacts,
         todo: wp.array(dtype=int),
         number: wp.array(dtype=int),
@@ -236,27 +254,31 @@ def make_contacts(real):
             n = contacts.count[env]
             if n == 0:
                 continue
-            couple(g, slot, n, contacts.body, bodies.inv_mass, env, lane)
+            if wp.static(trees):
+                couple_trees(g, slot, n, contacts.body, bodies.shared, env, lane)
+            else:
+                couple(g, slot, n, contacts.body, bodies.inv_mass, env, lane)
             if analyse(g, slot, n, lane):
                 for i in range(lane, n, wp.block_dim()):
-                    for e in range(g.row[slot, i], g.row[slot, i + 1]):
-                        g.block[slot, e] = delassus(
-                            contacts.body,
-                            contacts.point,
-                            contacts.frame,
-                            bodies.com,
-                            bodies.inv_mass,
-                            bodies.inv_inertia,
-                            env,
-                            i,
-                            g.column[slot, e],
-                        )
-                    w = delassus(
-                        contacts.body, contacts.point, contacts.frame, bodies.com, bodies.inv_mass, bodies.inv_inertia, env, i, i
-                    ) + wp.diag(contacts.relaxation[env, i])
-                    g.diagonal[slot, i] = w
+                    # Row i of W, its own block last.
+                    for e in range(g.row[slot, i], g.row[slot, i + 1] + 1):
+                        j = int(i)
+                        if e < g.row[slot, i + 1]:
+                            j = g.column[slot, e]
+                        block = mat33()
+                        if wp.static(trees):
+                            block = product(bodies.shared, bodies.half, contacts.body, bodies.longest, env, i, j)
+                            block = contacts.frame[env, i] * block * wp.transpose(contacts.frame[env, j])
+                        else:
+                            block = delassus(
+                                contacts.body, contacts.point, contacts.frame, bodies.com, bodies.inv_mass, bodies.inv_inertia, env, i, j
+                            )
+                        if e < g.row[slot, i + 1]:
+                            g.block[slot, e] = block
+                        else:
+                            g.diagonal[slot, i] = block + wp.diag(contacts.relaxation[env, i])
                     k = contacts.directions[env, i]
-                    inverse = weigh(wp.get_diag(w), k)
+                    inverse = weigh(wp.get_diag(g.diagonal[slot, i]), k)
                     c.rho[slot, i] = vec3(real(1.0) / inverse[0], real(1.0) / inverse[1], real(1.0) / inverse[2])
                     c.free[slot, i] = contacts.free[env, i]
                     c.mu[slot, i] = contacts.mu[env, i]

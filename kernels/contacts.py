@@ -14,9 +14,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import rigid
+from . import rigid, tree
 from .collide import FAR_PAIR, NO_POINT, pair_functions
-from .types import CONE, DISC, FACETS, FREE, OPTIONS, OVERFLOW, REGULARIZED, scalar_types
+from .types import CONE, DISC, FACETS, OPTIONS, OVERFLOW, REGULARIZED, scalar_types
 
 # Overlaps that no load explains are pushed apart no faster than this [m/s], whatever the stiffness; what turns comes on top.
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
@@ -316,14 +316,20 @@ def row_functions(real) -> SimpleNamespace:
 
 
 @functools.cache
-def make(real) -> SimpleNamespace:
-    """Kernels ``combine_pairs`` (dim N, P), ``select_contacts`` (dim E) and ``contact_rows`` (dim E, lanes)."""
+def make(real, trees: bool = False) -> SimpleNamespace:
+    """Kernels ``combine_pairs`` (dim N, P), ``select_contacts`` (dim E) and ``contact_rows`` (dim E, lanes).
+
+    trees: ``contact_rows`` for scenes with joints.
+    """
     t = scalar_types(real)
     vec3, vec5 = t.vec3, t.vec5
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     f = row_functions(real)
     contact_parameters, velocities, mobility = f.contact_parameters, f.velocities, f.mobility
     read_row, write_row = f.read_row, f.write_row
+    forest = tree.functions(real)
+    halve, product = forest.halve, forest.product
+    Mechanics = forest.Trees if trees else Bodies
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def combine_pairs(topology: Topology, parameters: Parameters):
@@ -337,7 +343,7 @@ def make(real) -> SimpleNamespace:
             mass = real(0.0)  # of the lighter movable body
             for side in range(2):
                 body = topology.pair_body[pair][side]
-                if body >= 0 and topology.joint_type[wp.max(body, 0)] == FREE:
+                if body >= 0 and topology.movable[wp.max(body, 0)] != 0:
                     m = parameters.mass[i % parameters.mass.shape[0], body]
                     if mass == real(0.0) or m < mass:
                         mass = m
@@ -402,7 +408,7 @@ def make(real) -> SimpleNamespace:
                     # other (1.1 mm of overlap at 1 ms with the approaching part alone, 3 um with this).
                     ahead = phi - fall - real(2.0) * h * hit
                     if ahead < real(0.0) or ahead * ahead < real(4.0) * h * h * wp.length_sq(u_free):
-                        if count < contacts.slot.shape[1]:
+                        if count < contacts.room:
                             contacts.slot[env, count] = slot
                             contacts.velocity[env, count] = u
                             contacts.free[env, count] = u_free
@@ -488,7 +494,7 @@ def make(real) -> SimpleNamespace:
     def contact_rows(
         topology: Topology,
         parameters: Parameters,
-        bodies: Bodies,
+        mechanics: Mechanics,
         slots: Slots,
         h: real,
         sliding: int,
@@ -507,10 +513,21 @@ def make(real) -> SimpleNamespace:
                 u_free = contacts.free[env, i]
                 body = topology.pair_body[topology.slot_pair[slot]]
                 point = slots.point[env, slot]
-                w_nn = mobility(bodies, env, body, point, slots.normal[env, slot])
-                row = read_row(topology, parameters, slots, env, slot, w_nn, u, u_free, h, sliding, directions, frozen)
-                w_1 = mobility(bodies, env, body, point, row.frame[1])
-                row.inv_mass = vec3(w_nn, w_1, mobility(bodies, env, body, point, row.frame[2]))
-                write_row(contacts, env, i, body, point, slots.gap[env, slot], row)
+                n = slots.normal[env, slot]
+                if wp.static(trees):
+                    contacts.body[env, i] = body
+                    for side in range(2):
+                        if body[side] >= 0:
+                            halve(mechanics, env, 2 * i + side, body[side], point)
+                    w = product(mechanics.shared, mechanics.half, contacts.body, mechanics.longest, env, i, i)
+                    row = read_row(topology, parameters, slots, env, slot, wp.dot(n, w * n), u, u_free, h, sliding, directions, frozen)
+                    row.inv_mass = wp.get_diag(row.frame * w * wp.transpose(row.frame))
+                    write_row(contacts, env, i, body, point, slots.gap[env, slot], row)
+                else:
+                    w_nn = mobility(mechanics, env, body, point, n)
+                    row = read_row(topology, parameters, slots, env, slot, w_nn, u, u_free, h, sliding, directions, frozen)
+                    w_1 = mobility(mechanics, env, body, point, row.frame[1])
+                    row.inv_mass = vec3(w_nn, w_1, mobility(mechanics, env, body, point, row.frame[2]))
+                    write_row(contacts, env, i, body, point, slots.gap[env, slot], row)
 
     return SimpleNamespace(combine_pairs=combine_pairs, select_contacts=select_contacts, contact_rows=contact_rows)

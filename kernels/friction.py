@@ -11,6 +11,7 @@ All laws are one law with different admissible sets. Slip is a normal of the set
         k >= 2   {|e_j . s| <= 1}, e_j at angles j pi / k from t1: facets around the disc (eqs. 18, 19; 29, 30 without w);
                  k = 2 has a limit of its own for each axis (eq. 34)
        -k <= -2  the convex hull of +-e_j: facets within the disc (Anitescu and Potra, the paper's ref. 6)
+       -1        no contact: rows of a joint that closes a loop, any impulse on all three
 
 `bound` is a limit that does not depend on the present normal impulse: the box and hybrid laws (refs. 7, 12), with mu = 0.
 """
@@ -20,12 +21,15 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from .types import DISC, scalar_types
+from .types import DISC, HELD, scalar_types
 
 
 @functools.cache
-def functions(real) -> SimpleNamespace:
-    """``project_friction``, ``admissible`` (pi), ``slope`` (its generalised derivative), ``weigh`` and ``law_error``."""
+def functions(real, joints: bool = False) -> SimpleNamespace:
+    """``project_friction``, ``admissible`` (pi), ``slope`` (its generalised derivative), ``weigh`` and ``law_error``.
+
+    joints: there may be rows of joints that close loops (HELD) among the contacts.
+    """
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
 
@@ -65,7 +69,11 @@ def functions(real) -> SimpleNamespace:
         """pi(x)."""
         normal = wp.max(x[0], real(0.0))
         p_t = project_friction(vec2(x[1], x[2]), mu * normal + bound, k)
-        return vec3(normal, p_t[0], p_t[1])
+        result = vec3(normal, p_t[0], p_t[1])
+        if wp.static(joints):  # noqa: SIM102
+            if k == HELD:
+                result = x
+        return result
 
     @wp.func
     def slope(x: vec3, mu: vec2, bound: vec2, k: int) -> mat33:
@@ -120,13 +128,19 @@ def functions(real) -> SimpleNamespace:
                     corner += wp.sign(along) * half * across
                 d[1, 0] = grows * mu[0] * corner[0]
                 d[2, 0] = grows * mu[0] * corner[1]
+        if wp.static(joints):  # noqa: SIM102
+            if k == HELD:
+                d = wp.identity(n=3, dtype=real)
         return d
 
     @wp.func
     def weigh(w: vec3, k: int) -> vec3:
         """1 / rho of a contact from the diagonal of its block of W; only the rectangle may have two masses for its tangents."""
         result = w
-        if k != 2:
+        tied = k != 2
+        if wp.static(joints):
+            tied = tied and k != HELD
+        if tied:
             result[1] = real(0.5) * (w[1] + w[2])
             result[2] = result[1]
         for i in range(3):
@@ -143,6 +157,10 @@ def functions(real) -> SimpleNamespace:
         y = vec2(p[1] * w[1], p[2] * w[2])
         limit = mu * wp.max(p[0], real(0.0)) + bound
         target = project_friction(y - vec2(u[1], u[2]), vec2(limit[0] * w[1], limit[1] * w[2]), k)
-        return vec3(wp.min(u[0], p[0] * w[0]), y[0] - target[0], y[1] - target[1])
+        result = vec3(wp.min(u[0], p[0] * w[0]), y[0] - target[0], y[1] - target[1])
+        if wp.static(joints):  # noqa: SIM102
+            if k == HELD:
+                result = u
+        return result
 
     return SimpleNamespace(project_friction=project_friction, admissible=admissible, slope=slope, weigh=weigh, law_error=law_error)

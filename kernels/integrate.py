@@ -20,24 +20,10 @@ from .types import FIXED, FREE, OPTIONS, scalar_types
 def make(real) -> SimpleNamespace:
     """Kernels ``integrate`` and ``integrate_midpoint`` (dim E, B), and ``guard`` (dim E), which goes before the latter."""
     t = scalar_types(real)
-    vec3, quat, transform, spatial = t.vec3, t.quat, t.transform, t.spatial
+    vec3, spatial = t.vec3, t.spatial
     Bodies, Contacts, Parameters, Topology = t.Bodies, t.Contacts, t.Parameters, t.Topology
-    point_velocity = rigid.functions(real).point_velocity
-
-    @wp.func
-    def rotation_by(w: vec3, h: real) -> quat:
-        """exp(h w)."""
-        angle = h * wp.length(w)
-        turn = wp.quat_identity(dtype=real)
-        if angle > real(0.0):
-            turn = wp.quat_from_axis_angle(wp.normalize(w), angle)
-        return turn
-
-    @wp.func
-    def moved(pose: transform, com: vec3, velocity: vec3, turn: quat, h: real) -> transform:
-        """Pose of the body frame: the centre of mass moves straight, the body turns about it."""
-        offset = wp.quat_rotate(turn, wp.transform_get_translation(pose) - com)
-        return transform(com + h * velocity + offset, wp.normalize(turn * wp.transform_get_rotation(pose)))
+    f = rigid.functions(real)
+    point_velocity, rotation_by, moved = f.point_velocity, f.rotation_by, f.moved
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def integrate(

@@ -22,20 +22,22 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import linear, problem, rigid
+from . import linear, problem, rigid, tree
 from .solve_batch import solver
 from .types import BLOCK_OPTIONS, ITERATION_LIMIT, scalar_types, sync
 
 
 @functools.cache
-def functions(real) -> SimpleNamespace:
+def functions(real, trees: bool = False) -> SimpleNamespace:
     """Workspace and the functions ``assemble`` and ``impulses``."""
     t = scalar_types(real)
-    vec2, vec3 = t.vec2, t.vec3
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     Bodies, Contacts = t.Bodies, t.Contacts
     LcpWorkspace = problem.functions(real).LcpWorkspace
     invert = linear.functions(real).invert
     delassus = rigid.functions(real).delassus
+    forest = tree.functions(real)
+    product, Mechanics = forest.product, forest.Trees if trees else Bodies
 
     @wp.struct
     class ContactWorkspace:
@@ -44,6 +46,17 @@ def functions(real) -> SimpleNamespace:
         G: wp.array3d(dtype=real)  # [P, 2 R, R + 1] A^-1 W_tn; last column A^-1 b_t
         friction: wp.array2d(dtype=int)  # [P, R + 1] index of the contact within A, -1 = frictionless; last: their number
         start: wp.array2d(dtype=int)  # [P, R + 1] first unknown of each contact; last: number of unknowns
+
+    @wp.func
+    def block_of(bodies: Mechanics, contacts: Contacts, env: int, i: int, j: int) -> mat33:
+        """Block (i, j) of J M^-1 J^T, rows and columns n t1 t2."""
+        block = mat33()
+        if wp.static(trees):
+            block = product(bodies.shared, bodies.half, contacts.body, bodies.longest, env, i, j)
+            block = contacts.frame[env, i] * block * wp.transpose(contacts.frame[env, j])
+        else:
+            block = delassus(contacts.body, contacts.point, contacts.frame, bodies.com, bodies.inv_mass, bodies.inv_inertia, env, i, j)
+        return block
 
     @wp.func
     def direction(k: int, m: int) -> vec2:
@@ -72,12 +85,12 @@ def functions(real) -> SimpleNamespace:
         sync()
 
     @wp.func
-    def eliminate(ws: ContactWorkspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, r: int, lane: int):
+    def eliminate(ws: ContactWorkspace, bodies: Mechanics, contacts: Contacts, env: int, slot: int, r: int, lane: int):
         """W, A^-1 and G."""
         for ij in range(lane, r * r, wp.block_dim()):
             i = ij // r
             j = ij % r
-            block = delassus(contacts.body, contacts.point, contacts.frame, bodies.com, bodies.inv_mass, bodies.inv_inertia, env, i, j)
+            block = block_of(bodies, contacts, env, i, j)
             for a in range(3):
                 if i == j:
                     block[a, a] += contacts.relaxation[env, i][a]
@@ -108,7 +121,7 @@ def functions(real) -> SimpleNamespace:
 
     @wp.func
     def assemble(
-        lcp: LcpWorkspace, ws: ContactWorkspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, rho_scale: real, lane: int
+        lcp: LcpWorkspace, ws: ContactWorkspace, bodies: Mechanics, contacts: Contacts, env: int, slot: int, rho_scale: real, lane: int
     ) -> int:
         """Lead matrix and vector of eq. 35 after elimination, in lcp.M and lcp.q; returns the number of unknowns."""
         r = contacts.count[env]
@@ -217,7 +230,7 @@ def functions(real) -> SimpleNamespace:
 
     @wp.func
     def assemble_generators(
-        lcp: LcpWorkspace, ws: ContactWorkspace, bodies: Bodies, contacts: Contacts, env: int, slot: int, lane: int
+        lcp: LcpWorkspace, ws: ContactWorkspace, bodies: Mechanics, contacts: Contacts, env: int, slot: int, lane: int
     ) -> int:
         """The LCP of Anitescu and Potra in lcp.M and lcp.q; returns the number of unknowns."""
         r = contacts.count[env]
@@ -237,7 +250,7 @@ def functions(real) -> SimpleNamespace:
             sj = ws.start[slot, j]
             ki = -contacts.directions[env, i]
             kj = -contacts.directions[env, j]
-            block = delassus(contacts.body, contacts.point, contacts.frame, bodies.com, bodies.inv_mass, bodies.inv_inertia, env, i, j)
+            block = block_of(bodies, contacts, env, i, j)
             if i == j:
                 block += wp.diag(contacts.relaxation[env, i])
             for a in range(ws.start[slot, i + 1] - si):
@@ -279,14 +292,15 @@ def functions(real) -> SimpleNamespace:
 
 
 @functools.cache
-def make(real, method: str, generators: bool = False):
+def make(real, method: str, generators: bool = False, trees: bool = False):
     """Kernel ``assembled_lcp`` for 'lemke', 'murty' or 'judice_pires', of eq. 39 or of Anitescu and Potra.
 
     Launch tiled with dim (P): workspace p serves the environments todo[p], todo[p + P], ... of todo[:number].
     """
     t = scalar_types(real)
     Bodies, Contacts = t.Bodies, t.Contacts
-    f = functions(real)
+    f = functions(real, trees)
+    Mechanics = tree.functions(real).Trees if trees else Bodies
     ContactWorkspace, assemble, impulses = f.ContactWorkspace, f.assemble, f.impulses
     assemble_generators, generated_impulses = f.assemble_generators, f.generated_impulses
     LcpWorkspace = problem.functions(real).LcpWorkspace
@@ -294,7 +308,7 @@ def make(real, method: str, generators: bool = False):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def assembled_lcp(
-        bodies: Bodies,
+        bodies: Mechanics,
         contacts: Contacts,
         todo: wp.array(dtype=int),
         number: wp.array(dtype=int),

@@ -10,20 +10,22 @@ import functools
 
 import warp as wp
 
-from . import friction, rigid
-from .types import ITERATION_LIMIT, OPTIONS, scalar_types
+from . import friction, rigid, tree
+from .types import HELD, ITERATION_LIMIT, OPTIONS, scalar_types
 
 
 @functools.cache
-def make(real):
-    """Kernel ``pgs``; launch with dim (E)."""
+def make(real, trees: bool = False):
+    """Kernel ``pgs``; launch with dim (E). trees: for scenes with joints, whose v are those of Trees.half."""
     t = scalar_types(real)
     vec2, vec3, spatial = t.vec2, t.vec3, t.spatial
     Bodies, Contacts = t.Bodies, t.Contacts
-    law = friction.functions(real)
+    law = friction.functions(real, trees)
     project_friction, weigh = law.project_friction, law.weigh
     f = rigid.functions(real)
     point_velocity, wrench, response = f.point_velocity, f.wrench, f.response
+    forest = tree.functions(real)
+    gather, scatter, Mechanics = forest.gather, forest.scatter, forest.Trees if trees else Bodies
 
     @wp.func
     def relative(
@@ -44,7 +46,7 @@ def make(real):
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def pgs(
-        bodies: Bodies,
+        bodies: Mechanics,
         contacts: Contacts,
         todo: wp.array(dtype=int),
         number: wp.array(dtype=int),
@@ -59,8 +61,12 @@ def make(real):
         for index in range(start, number[0], stride):
             env = todo[index]
             r = contacts.count[env]
-            for b in range(velocity.shape[1]):
-                velocity[env, b] = bodies.free_velocity[env, b]
+            if wp.static(trees):
+                for k in range(bodies.mean.shape[1]):
+                    bodies.mean[env, k] = real(0.0)
+            else:
+                for b in range(velocity.shape[1]):
+                    velocity[env, b] = bodies.free_velocity[env, b]
             for i in range(r):
                 contacts.impulse[env, i] = vec3()
             change = real(0.0)
@@ -79,27 +85,50 @@ def make(real):
                     p = contacts.impulse[env, i]
                     old = p
 
-                    relaxed = free + frame * relative(velocity, bodies.free_velocity, bodies.com, env, body, point) + wp.cw_mul(eps, p)
-                    p[0] = wp.max(p[0] - relaxed[0] / diagonal[0], real(0.0))
+                    u = vec3()
+                    if wp.static(trees):
+                        u = gather(bodies, bodies.mean, env, i, body)
+                    else:
+                        u = relative(velocity, bodies.free_velocity, bodies.com, env, body, point)
+                    relaxed = free + frame * u + wp.cw_mul(eps, p)
+                    held = bool(False)
+                    if wp.static(trees):
+                        held = k == HELD
+                    p[0] = p[0] - relaxed[0] / diagonal[0]
+                    if not held:
+                        p[0] = wp.max(p[0], real(0.0))
                     push = frame[0] * (p[0] - old[0])
-                    for side in range(2):
-                        b = body[side]
-                        if b >= 0:
-                            arm = point - bodies.com[env, b]
-                            sign = real(2 * side - 1)
-                            velocity[env, b] += response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], wrench(arm, sign * push))
-                    if k != 0:
-                        relaxed = free + frame * relative(velocity, bodies.free_velocity, bodies.com, env, body, point) + wp.cw_mul(eps, p)
-                        x = vec2(p[1] - relaxed[1] / diagonal[1], p[2] - relaxed[2] / diagonal[2])
-                        x = project_friction(x, contacts.mu[env, i] * p[0] + contacts.bound[env, i], k)
-                        p = vec3(p[0], x[0], x[1])
-                        push = frame[1] * (p[1] - old[1]) + frame[2] * (p[2] - old[2])
+                    if wp.static(trees):
+                        scatter(bodies, bodies.mean, env, i, body, push)
+                    else:
                         for side in range(2):
                             b = body[side]
                             if b >= 0:
                                 arm = point - bodies.com[env, b]
                                 sign = real(2 * side - 1)
                                 velocity[env, b] += response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], wrench(arm, sign * push))
+                    if k != 0:
+                        if wp.static(trees):
+                            u = gather(bodies, bodies.mean, env, i, body)
+                        else:
+                            u = relative(velocity, bodies.free_velocity, bodies.com, env, body, point)
+                        relaxed = free + frame * u + wp.cw_mul(eps, p)
+                        x = vec2(p[1] - relaxed[1] / diagonal[1], p[2] - relaxed[2] / diagonal[2])
+                        if not held:
+                            x = project_friction(x, contacts.mu[env, i] * p[0] + contacts.bound[env, i], k)
+                        p = vec3(p[0], x[0], x[1])
+                        push = frame[1] * (p[1] - old[1]) + frame[2] * (p[2] - old[2])
+                        if wp.static(trees):
+                            scatter(bodies, bodies.mean, env, i, body, push)
+                        else:
+                            for side in range(2):
+                                b = body[side]
+                                if b >= 0:
+                                    arm = point - bodies.com[env, b]
+                                    sign = real(2 * side - 1)
+                                    velocity[env, b] += response(
+                                        bodies.inv_mass[env, b], bodies.inv_inertia[env, b], wrench(arm, sign * push)
+                                    )
                     contacts.impulse[env, i] = p
                     change = wp.max(change, wp.max(wp.abs(wp.cw_mul(diagonal, p - old))))
                 sweep += 1

@@ -46,8 +46,8 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import friction, rigid, sparse
-from .types import BLOCK_OPTIONS, CLOSED, ITERATION_LIMIT, scalar_types, sync
+from . import friction, sparse, systems
+from .types import BLOCK_OPTIONS, CLOSED, DISC, HELD, ITERATION_LIMIT, scalar_types, sync
 
 AXIS_STICKS = 0
 AXIS_SLIDES_UP = 1  # along +t: the impulse is -mu p_n
@@ -69,7 +69,7 @@ MOST_LOOKS = 24
 
 
 @functools.cache
-def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
+def functions(real, cone: bool, frozen: bool, joints: bool = False) -> SimpleNamespace:
     """Functions of one contact, whatever solves the linear system: ``operator`` and ``update``.
 
     cone: Coulomb's cone instead of two axes; frozen: limits that do not follow p_n. They take numbers, not bundles: Warp passes
@@ -171,15 +171,21 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
         shift = vec3()
         column = frame[0]
         axes = frame
+        held = bool(False)
+        if wp.static(joints):
+            held = k == HELD
+        if held:
+            matrix = wp.transpose(frame) * wp.diag(wp.cw_div(vec3(real(1.0)), eps)) * frame
+            shift = wp.transpose(frame) * wp.cw_div(free, eps)
         f = free
         e = eps
         if wp.static(cone):  # noqa: SIM102
-            if axis_state(state, 0) != AXIS_STICKS:  # axes along and across the slip
+            if (k == DISC or wp.static(not joints)) and axis_state(state, 0) != AXIS_STICKS:  # axes along and across the slip
                 along = slip[0] * frame[1] + slip[1] * frame[2]
                 axes = wp.matrix_from_rows(frame[0], along, wp.cross(frame[0], along))
                 f = vec3(free[0], slip[0] * free[1] + slip[1] * free[2], slip[0] * free[2] - slip[1] * free[1])
                 e[2] = slip[2]
-        if has_friction(state, bound, k):
+        if not held and has_friction(state, bound, k):
             for axis in range(2):
                 t = axes[1 + axis]
                 if axis_state(state, axis) == AXIS_STICKS:
@@ -193,7 +199,7 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
                     column += (sign * mu[axis]) * t
                     if wp.static(frozen):
                         shift -= (sign * bound[axis]) * t
-        if (state & CLOSED) != 0:
+        if not held and (state & CLOSED) != 0:
             column = column * (real(1.0) / eps[0])
             matrix += wp.outer(column, frame[0])
             shift += column * free[0]
@@ -207,6 +213,9 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
         """
         p = vec3()
         turned = slip
+        if wp.static(joints):  # noqa: SIM102
+            if k == HELD:
+                return -wp.cw_div(relaxed, eps), state, turned, False
         pressed = -relaxed[0] / eps[0]
         closed = next_closed(relaxed[0], pressed, w[0] + eps[0], state, tolerance)
         after = closed | (state & 30)
@@ -214,12 +223,14 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
         pressed = wp.max(pressed, real(0.0))
         if (state & CLOSED) != 0:
             p[0] = pressed
+        on_cone = bool(False)
         if wp.static(cone):
-            if k != 0:
+            on_cone = k == DISC or (wp.static(not joints) and k != 0)
+            if on_cone:
                 if (state & CLOSED) != 0:
                     p += cone_friction(relaxed, eps, mu[0] * pressed, state)
                 after, turned, again = next_cone(relaxed, eps, w, mu[0], pressed, closed, state, slip)
-        elif has_friction(state, bound, k):
+        if not on_cone and has_friction(state, bound, k):
             limit = mu * p[0] + bound
             next_limit = bound
             if closed != 0:
@@ -236,170 +247,21 @@ def functions(real, cone: bool, frozen: bool) -> SimpleNamespace:
 
 
 @functools.cache
-def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
-    """Bundle ``Workspace`` and kernel ``pivot`` for scenes with several movable bodies; launch tiled with dim (P)."""
+def make(real, cone: bool, frozen: bool, trees: bool = False) -> SimpleNamespace:
+    """Bundle ``Workspace`` and kernel ``pivot`` for scenes with several movable bodies, or with joints; launch tiled with dim (P)."""
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     vec6 = wp.types.vector(length=6, dtype=real)
-    mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
-    Bodies, Contacts = t.Bodies, t.Contacts
-    f = functions(real, cone, frozen)
+    Contacts = t.Contacts
+    f = functions(real, cone, frozen, trees)
     operator, update = f.operator, f.update
-    law = friction.functions(real)
+    law = friction.functions(real, trees)
     admissible, slope, weigh = law.admissible, law.slope, law.weigh
-    times_skew, skew_times = rigid.functions(real).times_skew, rigid.functions(real).skew_times
     s = sparse.functions(real, 6)
-    Graph, clear, connect, analyse, clear_factors = s.Graph, s.clear, s.connect, s.analyse, s.clear_factors
-    factorise, solve = s.factorise, s.solve
-
-    @wp.struct
-    class Workspace:
-        """Systems of the movable bodies of P environments."""
-
-        number: wp.array(dtype=int)  # [B] of a body among those that answer to forces, -1 = it does not
-        body: wp.array(dtype=int)  # [n] its inverse
-        begin: wp.array2d(dtype=int)  # [P, n + 1] first contact of each movable body in `contact`
-        contact: wp.array2d(dtype=int)  # [P, 2 R]
-        matrix: wp.array2d(dtype=mat33)  # [P, R] K
-        shift: wp.array2d(dtype=vec3)  # [P, R] g
-        change: wp.array2d(dtype=vec6)  # [P, n] what x becomes; while Newton's method runs dx
-        scratch: wp.array2d(dtype=vec6)  # [P, n]
-        flips: wp.array(dtype=int)  # [P]
-        # Of Newton's method with a line search:
-        present: wp.array2d(dtype=vec6)  # [P, n] x where the step starts
-        relaxed: wp.array2d(dtype=vec3)  # [P, R] f + J x there
-        stiffness: wp.array2d(dtype=vec3)  # [P, R] 1 / eps
-        ahead: wp.array2d(dtype=vec3)  # [P, R] J dx
-        expected: wp.array2d(dtype=vec3)  # [P, R] impulse after the step, if no contact changes state
-        part: wp.array2d(dtype=vec3)  # [P, R] what a contact adds to the numbers of the line search
-
-    @wp.func
-    def node(number: wp.array(dtype=int), body: int) -> int:
-        result = int(-1)
-        if body >= 0:
-            result = number[body]
-        return result
-
-    @wp.func
-    def list_contacts(ws: Workspace, body: wp.array2d(dtype=wp.vec2i), env: int, slot: int, r: int, lane: int):
-        """Contacts of each movable body, in order."""
-        if lane == 0:
-            n = ws.body.shape[0]
-            for b in range(n + 1):
-                ws.begin[slot, b] = 0
-            for i in range(r):
-                for side in range(2):
-                    b = node(ws.number, body[env, i][side])
-                    if b >= 0:
-                        ws.begin[slot, b + 1] = ws.begin[slot, b + 1] + 1
-            for b in range(n):
-                ws.begin[slot, b + 1] = ws.begin[slot, b + 1] + ws.begin[slot, b]
-            for i in range(r):
-                for side in range(2):
-                    b = node(ws.number, body[env, i][side])
-                    if b >= 0:
-                        e = ws.begin[slot, b]
-                        ws.contact[slot, e] = i
-                        ws.begin[slot, b] = e + 1
-            # Now begin[b] is where body b ends, which is where the next one begins.
-            for bb in range(n):
-                ws.begin[slot, n - bb] = ws.begin[slot, n - bb - 1]
-            ws.begin[slot, 0] = 0
-        sync()
-
-    @wp.func
-    def couple(g: Graph, ws: Workspace, body: wp.array2d(dtype=wp.vec2i), env: int, slot: int, lane: int) -> bool:
-        """Bodies that share a contact are neighbours; False where there is no room for them."""
-        n = ws.body.shape[0]
-        for b in range(lane, n, wp.block_dim()):
-            clear(g, slot, n, b)
-            for e in range(ws.begin[slot, b], ws.begin[slot, b + 1]):
-                pair = body[env, ws.contact[slot, e]]
-                other = node(ws.number, pair[0]) + node(ws.number, pair[1]) - b
-                if other >= 0:
-                    connect(g, slot, b, other)
-        sync()
-        return analyse(g, slot, n, lane)
-
-    @wp.func
-    def blocks(vv: mat33, vw: mat33, wv: mat33, ww: mat33) -> mat66:
-        a = mat66()
-        for i in range(3):
-            for j in range(3):
-                a[i, j] = vv[i, j]
-                a[i, 3 + j] = vw[i, j]
-                a[3 + i, j] = wv[i, j]
-                a[3 + i, 3 + j] = ww[i, j]
-        return a
-
-    @wp.func
-    def add_block(g: Graph, slot: int, row: int, column: int, a: mat66):
-        """Subtract from the block of a body's row where the factors hold it."""
-        e = g.row[slot, row]
-        while g.column[slot, e] != column:
-            e += 1
-        target = g.target[slot, e]
-        if target >= 0:
-            g.upper[slot, target] = g.upper[slot, target] - a
-        else:
-            g.lower[slot, -1 - target] = g.lower[slot, -1 - target] - a
-
-    @wp.func
-    def assemble_row(
-        g: Graph,
-        ws: Workspace,
-        com: wp.array2d(dtype=vec3),
-        inv_mass: wp.array2d(dtype=real),
-        inv_inertia: wp.array2d(dtype=mat33),
-        body: wp.array2d(dtype=wp.vec2i),
-        point: wp.array2d(dtype=vec3),
-        env: int,
-        slot: int,
-        b: int,
-    ):
-        """The six rows of one body: its mass and what its contacts add, in the factors' memory."""
-        index = ws.body[b]
-        vv = wp.diag(vec3(real(1.0) / inv_mass[env, index]))
-        vw = mat33()
-        wv = mat33()
-        ww = wp.inverse(inv_inertia[env, index])
-        x = ws.present[slot, b]
-        bv = -(vv * vec3(x[0], x[1], x[2]))
-        bw = -(ww * vec3(x[3], x[4], x[5]))
-        for e in range(ws.begin[slot, b], ws.begin[slot, b + 1]):
-            i = ws.contact[slot, e]
-            pair = body[env, i]
-            matrix = ws.matrix[slot, i]
-            shift = ws.shift[slot, i]
-            other = pair[0]
-            if other == index:
-                shift = -shift
-                other = pair[1]
-            arm = point[env, i] - com[env, index]
-            right = times_skew(matrix, arm)
-            left = skew_times(arm, matrix)
-            vv += matrix
-            vw -= right
-            wv += left
-            ww -= skew_times(arm, right)
-            bv -= shift
-            bw -= wp.cross(arm, shift)
-            column = node(ws.number, other)
-            if column >= 0:
-                far = point[env, i] - com[env, other]
-                add_block(g, slot, b, column, blocks(matrix, -times_skew(matrix, far), left, -times_skew(left, far)))
-        g.pivot[slot, g.step[slot, b]] = blocks(vv, vw, wv, ww)
-        ws.change[slot, b] = vec6(bv[0], bv[1], bv[2], bw[0], bw[1], bw[2])
-
-    @wp.func
-    def body_change(ws: Workspace, com: wp.array2d(dtype=vec3), env: int, slot: int, body: int, point: vec3) -> vec3:
-        """J x of one body at a point."""
-        u = vec3()
-        b = node(ws.number, body)
-        if b >= 0:
-            x = ws.change[slot, b]
-            u = vec3(x[0], x[1], x[2]) + wp.cross(vec3(x[3], x[4], x[5]), point - com[env, body])
-        return u
+    Graph, clear_factors, factorise, solve = s.Graph, s.clear_factors, s.factorise, s.solve
+    system = systems.trees(real) if trees else systems.bodies(real)
+    Mechanics, Workspace, list_contacts, couple = system.Mechanics, system.Workspace, system.list_contacts, system.couple
+    assemble_row, change_at, energies = system.assemble_row, system.change_at, system.energies
 
     @wp.func
     def tangent(frame: mat33, relaxed: vec3, stiffness: vec3, mu: vec2, bound: vec2, k: int, follows: real):
@@ -415,35 +277,18 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
         return back * (d * wp.diag(stiffness)) * frame, -(back * admissible(x, mu, bound, k))
 
     @wp.func
-    def begin_search(
-        ws: Workspace,
-        com: wp.array2d(dtype=vec3),
-        inv_mass: wp.array2d(dtype=real),
-        inv_inertia: wp.array2d(dtype=mat33),
-        contacts: Contacts,
-        env: int,
-        slot: int,
-        r: int,
-        lane: int,
-    ):
-        """J dx, the impulses expected at x + dx, J dx . p(x), and in scratch dx . M x and dx . M dx of each body."""
+    def begin_search(ws: Workspace, mechanics: Mechanics, contacts: Contacts, env: int, slot: int, r: int, lane: int):
+        """J dx, the impulses expected at x + dx, J dx . p(x), and in scratch dx . M x and dx . M dx of each node."""
         for i in range(lane, r, wp.block_dim()):
-            body = contacts.body[env, i]
-            point = contacts.point[env, i]
             frame = contacts.frame[env, i]
-            du = body_change(ws, com, env, slot, body[1], point) - body_change(ws, com, env, slot, body[0], point)
+            du = change_at(ws, mechanics, contacts.body, contacts.point, env, slot, i)
             ws.ahead[slot, i] = frame * du
             shift = ws.shift[slot, i]
             ws.expected[slot, i] = -(frame * (ws.matrix[slot, i] * du + shift))
             ws.part[slot, i] = vec3(-wp.dot(du, shift), real(0.0), real(0.0))
         for b in range(lane, ws.body.shape[0], wp.block_dim()):
-            index = ws.body[b]
-            x = ws.present[slot, b]
-            d = ws.change[slot, b]
-            dv = vec3(d[0], d[1], d[2]) / inv_mass[env, index]
-            dw = wp.inverse(inv_inertia[env, index]) * vec3(d[3], d[4], d[5])
-            momentum = vec6(dv[0], dv[1], dv[2], dw[0], dw[1], dw[2])
-            ws.scratch[slot, b] = vec6(wp.dot(momentum, x), wp.dot(momentum, d), real(0.0), real(0.0), real(0.0), real(0.0))
+            energy = energies(ws, mechanics, env, slot, b)
+            ws.scratch[slot, b] = vec6(energy[0], energy[1], real(0.0), real(0.0), real(0.0), real(0.0))
         sync()
 
     @wp.func
@@ -520,7 +365,7 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
 
     @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
     def pivot(
-        bodies: Bodies,
+        mechanics: Mechanics,
         contacts: Contacts,
         todo: wp.array(dtype=int),
         number: wp.array(dtype=int),
@@ -587,16 +432,14 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
                     ws.flips[slot] = 0
                 sync()
                 for b in range(lane, n, wp.block_dim()):
-                    assemble_row(g, ws, bodies.com, bodies.inv_mass, bodies.inv_inertia, contacts.body, contacts.point, env, slot, b)
+                    assemble_row(g, ws, mechanics, contacts.body, contacts.point, env, slot, b)
                 sync()
                 factorise(g, slot, n, lane)
                 solve(g, slot, n, ws.change, ws.scratch, lane)
                 solves += 1
                 if attempt == 0:
                     for i in range(lane, r, wp.block_dim()):
-                        body = contacts.body[env, i]
-                        point = contacts.point[env, i]
-                        du = body_change(ws, bodies.com, env, slot, body[1], point) - body_change(ws, bodies.com, env, slot, body[0], point)
+                        du = change_at(ws, mechanics, contacts.body, contacts.point, env, slot, i)
                         bound = vec2()
                         if wp.static(frozen):
                             bound = contacts.bound[env, i]
@@ -624,7 +467,7 @@ def make(real, cone: bool, frozen: bool) -> SimpleNamespace:
                     searching = ws.flips[slot] > 0
                     sync()
                 else:
-                    begin_search(ws, bodies.com, bodies.inv_mass, bodies.inv_inertia, contacts, env, slot, r, lane)
+                    begin_search(ws, mechanics, contacts, env, slot, r, lane)
                     enough = real(MISS)
                     if softness > real(0.0):
                         enough = real(SOFT_MISS[attempt - 1]) * size

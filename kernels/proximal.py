@@ -52,14 +52,14 @@ HALVINGS = 7
 
 
 @functools.cache
-def functions(real) -> SimpleNamespace:
+def functions(real, joints: bool = False) -> SimpleNamespace:
     """Bundle ``ContactProblem`` and the function ``proximal_newton``."""
     t = scalar_types(real)
     vec2, vec3 = t.vec2, t.vec3
     double = real is wp.float64
     alpha_start = real(1.0e-3)
     alpha_least = real(1.0e-10) if double else real(1.0e-5)
-    law = friction.functions(real)
+    law = friction.functions(real, joints)
     admissible, slope = law.admissible, law.slope
     s = sparse.functions(real, 3)
     Graph, clear_factors, factorise, solve = s.Graph, s.clear_factors, s.factorise, s.solve

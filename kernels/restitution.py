@@ -87,6 +87,10 @@ def make(real) -> SimpleNamespace:
         for env in range(start, contacts.count.shape[0], stride):
             if i >= contacts.count[env]:
                 continue
+            if contacts.slot[env, i] < 0:  # a row of a joint
+                bounces.kick[env, i] = real(0.0)
+                bounces.before[env, i] = vec3()
+                continue
             pair = topology.slot_pair[contacts.slot[env, i]]
             row = env % bounces.coefficient.shape[0]
             e = real(0.5) * (bounces.coefficient[row, topology.pairs[pair, 0]] + bounces.coefficient[row, topology.pairs[pair, 1]])
@@ -134,6 +138,7 @@ def make(real) -> SimpleNamespace:
         kick: wp.array2d(dtype=real),
         before: wp.array2d(dtype=vec3),
         after: wp.array2d(dtype=vec3),
+        slot: wp.array2d(dtype=int),
         env: int,
         count: int,
         h: real,
@@ -146,6 +151,8 @@ def make(real) -> SimpleNamespace:
         total = real(0.0)
         size = real(0.0)
         for i in range(count):
+            if slot[env, i] < 0:  # a row of a joint: what a drive does is no rebound
+                continue
             p = impulse[env, i]
             u = before[env, i]
             mean = real(0.5) * (u + after[env, i])
@@ -219,6 +226,7 @@ def make(real) -> SimpleNamespace:
                     bounces.kick,
                     bounces.before,
                     contacts.velocity,
+                    contacts.slot,
                     env,
                     count,
                     h,

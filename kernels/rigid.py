@@ -13,7 +13,7 @@ from .types import scalar_types
 def functions(real) -> SimpleNamespace:
     """What a body does at a point; arm: from the centre of mass to the point, world axes."""
     t = scalar_types(real)
-    vec3, mat33, spatial = t.vec3, t.mat33, t.spatial
+    vec3, mat33, quat, transform, spatial = t.vec3, t.mat33, t.quat, t.transform, t.spatial
 
     @wp.func
     def point_velocity(twist: spatial, arm: vec3) -> vec3:
@@ -83,7 +83,24 @@ def functions(real) -> SimpleNamespace:
                             total -= block
         return frame[env, i] * total * wp.transpose(frame[env, j])
 
+    @wp.func
+    def rotation_by(w: vec3, h: real) -> quat:
+        """exp(h w)."""
+        angle = h * wp.length(w)
+        turn = wp.quat_identity(dtype=real)
+        if angle > real(0.0):
+            turn = wp.quat_from_axis_angle(wp.normalize(w), angle)
+        return turn
+
+    @wp.func
+    def moved(pose: transform, com: vec3, velocity: vec3, turn: quat, h: real) -> transform:
+        """Pose of the body frame: the centre of mass moves straight, the body turns about it."""
+        offset = wp.quat_rotate(turn, wp.transform_get_translation(pose) - com)
+        return transform(com + h * velocity + offset, wp.normalize(turn * wp.transform_get_rotation(pose)))
+
     return SimpleNamespace(
+        rotation_by=rotation_by,
+        moved=moved,
         point_velocity=point_velocity,
         wrench=wrench,
         response=response,

@@ -15,6 +15,7 @@ import warp as wp
 
 # Joint types as warp_lcp.model numbers them.
 FREE = wp.constant(0)
+KINEMATIC = wp.constant(1)
 FIXED = wp.constant(2)
 
 # Contact states reported per contact.
@@ -35,6 +36,7 @@ RESTITUTION_REDUCED = wp.constant(32)
 
 # Admissible friction of Coulomb's cone (Contacts.directions, kernels/friction.py).
 DISC = wp.constant(1)
+HELD = wp.constant(-1)  # no friction: three rows that take any impulse (kernels/joint_rows.py)
 
 # Lanes of a block that works on one environment.
 LANES = 32
@@ -78,6 +80,7 @@ def scalar_types(real) -> SimpleNamespace:
     @wp.struct
     class Topology:
         joint_type: wp.array(dtype=int)  # [B]
+        movable: wp.array(dtype=int)  # [B] do forces move it?
         joint_pose: wp.array(dtype=transform)  # [B]
         q_start: wp.array(dtype=int)  # [B]
         v_start: wp.array(dtype=int)  # [B]
@@ -117,8 +120,9 @@ def scalar_types(real) -> SimpleNamespace:
 
     @wp.struct
     class Contacts:
-        count: wp.array(dtype=int)  # [E]
-        slot: wp.array2d(dtype=int)  # [E, R]
+        room: int  # how many contacts there may be; what follows them are rows of joints
+        count: wp.array(dtype=int)  # [E] rows of both
+        slot: wp.array2d(dtype=int)  # [E, R] -1 - k: row k of the joints
         body: wp.array2d(dtype=wp.vec2i)  # [E, R] a, b; -1 = world
         point: wp.array2d(dtype=vec3)  # [E, R] world
         gap: wp.array2d(dtype=real)  # [E, R]

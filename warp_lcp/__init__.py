@@ -15,6 +15,8 @@ if not (_HERE / "kernels").is_dir():
 
 _PUBLIC = {
     "ContactSolution": "friction_problem",
+    "Control": "simulator",
+    "Drive": "model",
     "JointType": "model",
     "Material": "model",
     "MissingExtra": "errors",

@@ -4,15 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
+from . import joints
 from .errors import ModelError, positive_number
-from .model import CONTACT_POINTS, JointType, Material, Model, Report, ShapeType
+from .joints import AXES, Joint
+from .model import CONTACT_POINTS, JOINT_AXES, DofKind, Drive, JointType, Material, Model, Report, ShapeType
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+NO_LIMIT, NO_DRIVE = (-np.inf, np.inf), (0.0, 0.0, np.inf, 0.0, 0.0)
 CONTACT_FIELDS = ("normal_stiffness", "normal_damping", "tangent_stiffness", "tangent_damping", "slip_threshold")
 
 
@@ -104,6 +108,7 @@ class ModelBuilder:
         self._bodies: list[_Body] = []
         self._shapes: list[_Shape] = []
         self._filtered: set[tuple[int, int]] = set()
+        self._joints: list[Joint] = []
 
     def add_body(
         self,
@@ -148,6 +153,115 @@ class ModelBuilder:
             )
         )
         return len(self._bodies) - 1
+
+    def add_joint(
+        self,
+        type: JointType,
+        parent: int,
+        child: int,
+        *,
+        parent_frame: Sequence[float] = IDENTITY,
+        child_frame: Sequence[float] = IDENTITY,
+        axes: Sequence[str] | None = None,
+        armature: float | Sequence[float] = 0.0,
+        damping: float | Sequence[float] = 0.0,
+        friction: float | Sequence[float] = 0.0,
+        limit: Sequence[Any] | None = None,
+        drive: Drive | Sequence[Drive | None] | None = None,
+        loop: bool = False,
+        collide: bool = False,
+        name: str | None = None,
+    ) -> int:
+        """Join two bodies and return the joint's index.
+
+        Args:
+            type: what moves, see :class:`Model`.
+            parent, child: bodies; -1 = world.
+            parent_frame, child_frame: the joint's frame in the frame of either body; they coincide where the joint's coordinates are zero.
+                Where the bodies stand tells the coordinates at the start; a child that does not stand where the joint lets it is moved.
+            axes: what a D6 joint leaves free, of "tx", "ty", "tz", "rx", "ry", "rz".
+            armature: added to the inertia of each coordinate, kg or kg m^2.
+            damping: force against the velocity of each coordinate, N s/m or N m s.
+            friction: dry friction of each coordinate, N or N m.
+            limit: least and greatest coordinate (a pair for each, where there are several); infinite or None: no limit.
+            drive: what pulls each coordinate.
+            loop: never carry the child by this joint, hold both bodies where they are.
+            collide: let the shapes of the two bodies touch.
+            name: 'joint<i>' if omitted.
+
+        Raises:
+            ModelError: for a joint that is none, or a number that is not finite or negative.
+        """
+        name = f"joint{len(self._joints)}" if name is None else name
+        for body in (parent, child):
+            if not -1 <= body < len(self._bodies):
+                raise ModelError(f"{name}: body {body} does not exist; add_body returns the index to give here")
+        if parent == child:
+            raise ModelError(f"{name}: it joins {'the world' if parent < 0 else self._bodies[parent].name} to itself; give two bodies")
+        type = JointType(type)
+        if type in (JointType.FREE, JointType.KINEMATIC):
+            raise ModelError(f"{name}: {type.name} is no joint between bodies; say so in add_body")
+        if type is JointType.D6:
+            free = tuple(axes or ())
+            if any(a not in AXES for a in free) or len(set(free)) != len(free):
+                raise ModelError(f"{name}: axes are {free}; give some of {', '.join(AXES)}, each once")
+            free = tuple(a for a in AXES if a in free)
+        elif axes is not None:
+            raise ModelError(f"{name}: axes are for D6 joints, not for {type.name}")
+        else:
+            free = JOINT_AXES[type]
+        n = len(free)
+        limits, drives = _limits(name, limit, n), _drives(name, drive, n)
+        if type is JointType.SPHERICAL and (np.isfinite(limits).any() or drives[:, :2].any()):
+            raise ModelError(f"{name}: a SPHERICAL joint has no angles to limit or drive; use D6 with axes rx ry rz")
+        self._joints.append(
+            Joint(
+                name,
+                type,
+                parent,
+                child,
+                _pose(name, parent_frame),
+                _pose(name, child_frame),
+                free,
+                _per_axis(f"{name}: armature", armature, n),
+                _per_axis(f"{name}: damping", damping, n),
+                _per_axis(f"{name}: friction", friction, n),
+                limits,
+                drives,
+                collide=collide,
+                loop=loop,
+            )
+        )
+        return len(self._joints) - 1
+
+    def add_distance(
+        self,
+        parent: int,
+        child: int,
+        least: float,
+        greatest: float,
+        *,
+        parent_frame: Sequence[float] = IDENTITY,
+        child_frame: Sequence[float] = IDENTITY,
+        collide: bool = False,
+        name: str | None = None,
+    ) -> int:
+        """Keep two points, the origins of the frames, no closer than ``least`` and no further than ``greatest`` [m]. Returns its index."""
+        if not 0.0 <= least <= greatest:
+            raise ModelError(f"{name or 'distance'}: from {least} to {greatest} m is no range; give 0 <= least <= greatest")
+        index = self.add_joint(
+            JointType.D6,
+            parent,
+            child,
+            parent_frame=parent_frame,
+            child_frame=child_frame,
+            axes=AXES,
+            loop=True,
+            collide=collide,
+            name=name,
+        )
+        self._joints[index] = replace(self._joints[index], distance=(float(least), float(greatest)))
+        return index
 
     def add_plane(self, body: int = -1, *, pose: Sequence[float] = IDENTITY, **options) -> int:
         """Add an infinite plane with normal along the shape's +z to the world (-1), a fixed or a kinematic body.
@@ -239,18 +353,10 @@ class ModelBuilder:
         if not any(b.joint is not JointType.FIXED for b in self._bodies):
             raise ModelError("nothing can move: the scene has no free and no kinematic body; add one (in USD: PhysicsRigidBodyAPI)")
         mass, com, inertia = (np.array(x) for x in zip(*(self._mass_properties(i) for i in range(len(self._bodies))), strict=True))
-        joint = np.array([b.joint for b in self._bodies], dtype=np.int32)
-        moves = joint != JointType.FIXED
         shapes = self._shapes
-        return Model(
+        model = Model(
             body_names=tuple(b.name for b in self._bodies),
-            body_parent=np.full(len(joint), -1, dtype=np.int32),
-            joint_type=joint,
-            joint_pose=np.array([IDENTITY if m else b.pose for b, m in zip(self._bodies, moves, strict=True)], dtype=float),
-            q_start=(np.cumsum(7 * moves) - 7 * moves).astype(np.int32),
-            v_start=(np.cumsum(6 * moves) - 6 * moves).astype(np.int32),
-            q0=np.concatenate([b.pose for b, m in zip(self._bodies, moves, strict=True) if m]),
-            v0=np.concatenate([np.r_[b.velocity, b.angular_velocity] for b, m in zip(self._bodies, moves, strict=True) if m]),
+            **self._forest(com),
             mass=mass,
             com=com,
             inertia=inertia,
@@ -263,11 +369,75 @@ class ModelBuilder:
             friction=np.array([(s.material.static_friction, s.material.dynamic_friction) for s in shapes], dtype=float).reshape(-1, 2),
             contact=np.array([[getattr(s.material, f) for f in CONTACT_FIELDS] for s in shapes], dtype=float).reshape(-1, 5),
             restitution=np.array([s.material.restitution for s in shapes], dtype=float),
-            pairs=self._pairs(),
+            pairs=np.zeros((0, 2), dtype=np.int32),
             gravity=self.gravity.copy(),
             up_axis=self.up_axis,
             report=Report() if report is None else report,
         )
+        return replace(model, pairs=self._pairs(model.movable))
+
+    def _forest(self, com: np.ndarray) -> dict[str, Any]:
+        """Model's fields of bodies, joints and coordinates; coordinates in the order of the tree, parents first."""
+        bodies, count = self._bodies, len(self._bodies)
+        carried, order, loops = joints.forest([b.name for b in bodies], [b.joint for b in bodies], self._joints)
+        types, parents = [b.joint for b in bodies], np.full(count, -1, dtype=np.int32)
+        frames, child_frames = np.tile(IDENTITY, (count, 1)), np.tile(IDENTITY, (count, 1))
+        poses = np.array([b.pose for b in bodies])
+        starts: dict[str, np.ndarray] = {"q_start": np.zeros(count, dtype=np.int32), "v_start": np.zeros(count, dtype=np.int32)}
+        q0: list[np.ndarray] = []
+        v0: list[np.ndarray] = []
+        dofs: list[tuple[Any, ...]] = []
+        twists = np.zeros((count + 1, 6))  # velocity at the world's origin, angular velocity; the world's own is the last
+        for b in order:
+            body, joint = bodies[b], carried[b]
+            starts["q_start"][b], starts["v_start"][b] = sum(map(len, q0)), len(dofs)
+            if joint is None:
+                if body.joint is JointType.FIXED:
+                    frames[b] = body.pose
+                    continue
+                kind = DofKind.FREE if body.joint is JointType.FREE else DofKind.PRESCRIBED
+                q0.append(body.pose)
+                v0.append(np.r_[body.velocity, body.angular_velocity])
+                dofs += [(b, kind, np.eye(3)[k % 3], 0.0, 0.0, 0.0, NO_LIMIT, NO_DRIVE) for k in range(6)]
+                centre = body.pose[:3] + joints.rotate(body.pose[3:], com[b])
+                twists[b] = np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
+                continue
+            types[b], parents[b], frames[b], child_frames[b] = joint.type, joint.parent, joint.parent_frame, joint.child_frame
+            if joint.type is JointType.FIXED:  # one frame is enough
+                frames[b], child_frames[b] = joints.compose(joint.parent_frame, joints.inverse(joint.child_frame)), np.array(IDENTITY)
+            frame = joint.parent_frame if joint.parent < 0 else joints.compose(poses[joint.parent], joint.parent_frame)
+            q = joints.coordinates(joint, joints.compose(joints.inverse(frame), joints.compose(body.pose, joint.child_frame)))
+            placed = joints.compose(frame, joints.pose_of(joint, q))
+            poses[b] = joints.compose(placed, joints.inverse(joint.child_frame))
+            columns = joints.columns(joint, frame, q)
+            centre = poses[b][:3] + joints.rotate(poses[b][3:], com[b])
+            asked = np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
+            v = np.linalg.lstsq(columns, asked - twists[joint.parent], rcond=None)[0] if any(asked) else np.zeros(columns.shape[1])
+            twists[b] = twists[joint.parent] + columns @ v
+            q0.append(q)
+            v0.append(v)
+            axis = [np.eye(3)["xyz".index(a[1])] for a in joint.axes]
+            numbers = (joint.armature, joint.damping, joint.friction, joint.limit, joint.drive)
+            dofs += list(zip([b] * len(axis), joints.kinds(joint), axis, *numbers, strict=True))
+        columns_of = list(zip(*dofs, strict=True))
+        return {
+            "body_parent": parents,
+            "joint_type": np.array(types, dtype=np.int32),
+            "joint_pose": frames,
+            "joint_child_pose": child_frames,
+            **starts,
+            "q0": np.concatenate(q0),
+            "v0": np.concatenate(v0),
+            "dof_body": np.array(columns_of[0], dtype=np.int32),
+            "dof_kind": np.array(columns_of[1], dtype=np.int32),
+            "dof_axis": np.array(columns_of[2], dtype=float),
+            "armature": np.array(columns_of[3], dtype=float),
+            "damping": np.array(columns_of[4], dtype=float),
+            "joint_friction": np.array(columns_of[5], dtype=float),
+            "limit": np.array(columns_of[6], dtype=float).reshape(-1, 2),
+            "drive": np.array(columns_of[7], dtype=float).reshape(-1, 5),
+            "loops": tuple(joints.loop_of(joint) for joint in loops),
+        }
 
     def _mass_properties(self, index: int) -> tuple[float, np.ndarray, np.ndarray]:
         body = self._bodies[index]
@@ -292,20 +462,59 @@ class ModelBuilder:
             mass, inertia = body.mass, inertia * (body.mass / mass)
         return mass, com, inertia if body.inertia is None else body.inertia
 
-    def _pairs(self) -> np.ndarray:
+    def _pairs(self, moves: np.ndarray) -> np.ndarray:
         def movable(s: _Shape) -> bool:
-            return s.body >= 0 and self._bodies[s.body].joint is JointType.FREE
+            return bool(moves[s.body])
 
+        apart = [joint for joint in self._joints if min(joint.parent, joint.child) >= 0 and not joint.collide]
+        joined = {frozenset((joint.parent, joint.child)) for joint in apart}
         pairs = []
         for j, b in enumerate(self._shapes):
             for i, a in enumerate(self._shapes[:j]):
                 if a.body == b.body or not (movable(a) or movable(b)) or (i, j) in self._filtered:
+                    continue
+                if frozenset((a.body, b.body)) in joined:
                     continue
                 first, second = (i, j) if a.type <= b.type else (j, i)
                 kind = (self._shapes[first].type, self._shapes[second].type)
                 if kind in CONTACT_POINTS:
                     pairs.append((*kind, first, second))
         return np.array([p[2:] for p in sorted(pairs)], dtype=np.int32).reshape(-1, 2)
+
+
+def _per_axis(what: str, value: float | Sequence[float], n: int) -> np.ndarray:
+    array = np.broadcast_to(np.asarray(value, dtype=float), (n,)) if np.ndim(value) == 0 else _vector(what, value, n)  # type: ignore[arg-type]
+    if not (np.isfinite(array).all() and (array >= 0.0).all()):
+        raise ModelError(f"{what} is {array.tolist()}; it must be finite and not negative")
+    return array.copy()
+
+
+def _limits(name: str, value: Sequence[Any] | None, n: int) -> np.ndarray:
+    """[n, 2]"""
+    pairs = [value] if n == 1 and value is not None and np.ndim(value[0]) == 0 else value
+    limits = np.tile(np.array(NO_LIMIT), (n, 1))
+    if pairs is None:
+        return limits
+    if len(pairs) != n:
+        raise ModelError(f"{name}: limit has {len(pairs)} pairs; give {n}, one for each coordinate")
+    for i, pair in enumerate(pairs):
+        if pair is not None:
+            limits[i] = pair
+            if np.isnan(limits[i]).any() or limits[i][0] > limits[i][1]:
+                raise ModelError(f"{name}: limit {tuple(pair)} leaves no room; give the least coordinate first")
+    return limits
+
+
+def _drives(name: str, value: Drive | Sequence[Drive | None] | None, n: int) -> np.ndarray:
+    """[n, 5]"""
+    drives = [value] * n if value is None or isinstance(value, Drive) else list(value)
+    if len(drives) != n:
+        raise ModelError(f"{name}: {len(drives)} drives; give {n}, one for each coordinate")
+    table = np.array([NO_DRIVE if d is None else (d.stiffness, d.damping, d.max_force, d.target, d.target_velocity) for d in drives])
+    table = table.reshape(n, 5)
+    if not ((table[:, :3] >= 0.0).all() and np.isfinite(table[:, [0, 1, 3, 4]]).all()):
+        raise ModelError(f"{name}: drive {table.tolist()}: gains and force must not be negative, and all but the force finite")
+    return table
 
 
 _positive = partial(positive_number, error=ModelError)

@@ -157,14 +157,15 @@ def describe(reading: SceneReading, law: Law | None = None) -> dict[str, Any]:
 
 
 def _model_facts(model: Model, law: Law) -> dict[str, Any]:
-    from .model import JointType, ShapeType
+    import numpy as np
+
+    from .model import DofKind, JointType, ShapeType
 
     bodies, shapes = [], []
-    for name, joint, mass in zip(model.body_names, model.joint_type, model.mass, strict=True):
-        free = joint == JointType.FREE
-        bodies.append(
-            {"name": name, "joint": JointType(joint).name.lower(), "mass": float(mass) if free else None, "dofs": 6 if free else 0}
-        )
+    own = np.bincount(model.dof_body[model.dof_kind != DofKind.PRESCRIBED], minlength=model.num_bodies)
+    for b, name in enumerate(model.body_names):
+        joint, mass = JointType(model.joint_type[b]).name.lower(), float(model.mass[b]) if model.movable[b] else None
+        bodies.append({"name": name, "joint": joint, "mass": mass, "dofs": int(own[b])})
     for name, kind, body in zip(model.shape_names, model.shape_type, model.shape_body, strict=True):
         shapes.append({"name": name, "type": ShapeType(kind).name.lower(), "body": model.body_names[body] if body >= 0 else None})
     pairs = [[model.shape_names[a], model.shape_names[b]] for a, b in model.pairs]
@@ -192,12 +193,14 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
     """Bytes that one more environment takes, float64: state, contacts and their history, without the method's workspace."""
     import warp as wp
 
+    from . import articulation
     from .kernels import restitution
     from .kernels.types import scalar_types
     from .methods import chosen
 
     types, law = scalar_types(wp.float64), law or Law()
-    widths = {types.Bodies: model.num_bodies, types.Slots: model.num_slots, types.Contacts: model.max_contacts}
+    rows = model.max_contacts + (len(articulation.rows(model)) if model.articulated else 0)
+    widths = {types.Bodies: model.num_bodies, types.Slots: model.num_slots, types.Contacts: rows}
     if model.bounces:
         widths[restitution.make(wp.float64).Bounces] = model.max_contacts
     total = 2 * 8 * (model.nq + model.nv)  # q, q0, v, v0
@@ -205,8 +208,12 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
     total += 4 * 4 + 3 * 8  # status, iterations, unsolved, reason; residuals
     methods = [method(model, wp.float64, law) for method in chosen("auto", "float64", law)]
     total += 4 * (len(methods) + any(method.judges for method in methods))  # lists of environments
+    if model.articulated:
+        total += 4 + sum(number * wp.types.type_size_in_bytes(dtype) for _, number, dtype in articulation.layout(model, wp.float64))
     for bundle, width in widths.items():
         for name, variable in bundle.vars.items():
+            if not isinstance(variable.type, wp.array):  # a number
+                continue
             if (name == "slip" and not law.is_cone) or (name in ("hit", "alert") and not model.bodies_meet):
                 continue
             if name in ("coefficient", "again"):  # for all alike

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from . import articulation
 from .errors import WarpLcpError
 from .kernels import contact_problem, lcp, pgs, pivoting, problem, proximal, single, sparse
 from .kernels.types import LANES, scalar_types
@@ -68,9 +69,9 @@ def graph_workspace(real: Any, size: int, slots: int, n: int, blocks: int, fill:
     return graph
 
 
-def contact_workspace(real: Any, slots: int, n: int, blocks: int, fill: int, device: Any) -> tuple[Any, Any]:
+def contact_workspace(real: Any, slots: int, n: int, blocks: int, fill: int, device: Any, joints: bool = False) -> tuple[Any, Any]:
     """Graph and ContactProblem of `slots` problems of at most n contacts, for the proximal kernels."""
-    t, problem = scalar_types(real), proximal.functions(real).ContactProblem()
+    t, problem = scalar_types(real), proximal.functions(real, joints).ContactProblem()
     graph = graph_workspace(real, 3, slots, n, blocks, fill, device)
 
     def empty(dtype: Any) -> wp.array:
@@ -118,11 +119,17 @@ class AssembledLCP(Method):
     """A method for dense LCPs ('lemke', 'murty' or 'judice_pires') on the assembled LCP of eq. 39, no fallback."""
 
     def __init__(self, solver: str, model: Model, real: Any, law: Law):
-        self.kernel = lcp.make(real, solver, law.has_generators)
+        if model.loops:
+            raise WarpLcpError(f"method {solver!r} takes no joints that close loops yet; choose auto, proximal_newton or pgs")
+        if law.has_generators and model.articulated and articulation.rows(model):
+            raise WarpLcpError(
+                f"method {solver!r} takes no limits and drives with {law.formulation!r}; choose auto, proximal_newton or pgs"
+            )
+        self.kernel = lcp.make(real, solver, law.has_generators, model.articulated)
 
     def prepare(self, sim: Simulator) -> None:
         real = sim.real
-        r = min(sim.model.max_contacts, LCP_UNKNOWNS // sim.law.unknowns)
+        r = min(sim.rows.slot.shape[1], LCP_UNKNOWNS // sim.law.unknowns)
         n = r * sim.law.unknowns
         slots = workspaces(sim.num_envs, 2 * n * n + 15 * r * r, sim.device)
         self.lcp = lcp_workspace(real, slots, n, sim.device)
@@ -136,7 +143,7 @@ class AssembledLCP(Method):
         self.slots = slots
 
     def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
-        inputs = [sim.bodies, sim.rows, todo, number, sim.rho_scale, self.lcp, self.contacts, sim.iterations, sim.reason]
+        inputs = [sim.mechanics, sim.rows, todo, number, sim.rho_scale, self.lcp, self.contacts, sim.iterations, sim.reason]
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
@@ -149,17 +156,17 @@ class ProximalNewton(Method):
     NEIGHBOURS, FILL = 128, 256
 
     def __init__(self, model: Model, real: Any, law: Law):
-        self.kernel = contact_problem.make_contacts(real)
+        self.kernel = contact_problem.make_contacts(real, model.articulated)
 
     def prepare(self, sim: Simulator) -> None:
-        n = sim.model.max_contacts
+        n = sim.rows.slot.shape[1]
         blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
         self.slots = workspaces(sim.num_envs, 53 * n + 10 * blocks + 19 * fill, sim.device)
-        self.workspace = contact_workspace(sim.real, self.slots, n, blocks, fill, sim.device)
+        self.workspace = contact_workspace(sim.real, self.slots, n, blocks, fill, sim.device, sim.model.articulated)
 
     def launch(self, sim: Simulator, todo: wp.array, number: wp.array) -> None:
         accuracy = (1e-12, 1e-6) if sim.real is wp.float64 else (1e-6, 1e-2)  # of velocities, of impulses; relative
-        inputs = [sim.bodies, sim.rows, todo, number, self.SWEEPS, self.LIMIT, *accuracy, *self.workspace, sim.iterations, sim.reason]
+        inputs = [sim.mechanics, sim.rows, todo, number, self.SWEEPS, self.LIMIT, *accuracy, *self.workspace, sim.iterations, sim.reason]
         wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
@@ -174,13 +181,14 @@ class VelocityPivoting(Method):
 
     def __init__(self, model: Model, real: Any, law: Law):
         self.movable = np.flatnonzero(model.joint_type == JointType.FREE)
-        self.kind = (real, law.is_cone, law.has_frozen_limits)
+        # Drives and dry friction of joints have limits that no normal impulse changes, as frozen laws do.
+        self.kind = (real, law.is_cone, law.has_frozen_limits or bool(model.articulated and articulation.rows(model)))
         self.parts = None
-        if len(self.movable) == 1:
+        if len(self.movable) == 1 and not model.articulated:
             self.judges = self.makes_rows = True
             self.kernel = single.make(*self.kind, self.makes_rows)
         else:
-            self.parts = pivoting.make(*self.kind)
+            self.parts = pivoting.make(*self.kind, model.articulated)
             self.kernel = self.parts.pivot
         if model.bounces:
             self.take_rows()
@@ -193,19 +201,23 @@ class VelocityPivoting(Method):
     def prepare(self, sim: Simulator) -> None:
         if self.parts is None:
             return
-        n, contacts = len(self.movable), sim.model.max_contacts
+        contacts = sim.rows.slot.shape[1]
+        if sim.model.articulated:
+            velocity, nodes = articulation.nodes(articulation.paths(sim.model))
+            body = np.zeros(len(velocity), dtype=np.intp)
+        else:
+            velocity, body, nodes = np.zeros((0, 6)), self.movable, np.full((sim.model.num_bodies, 1), -1, dtype=np.int32)
+            nodes[self.movable, 0] = np.arange(len(body))
+        n, most = len(body), nodes.shape[1]
         blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
         self.slots = workspaces(sim.num_envs, 60 * n + blocks + 73 * fill + 28 * contacts, sim.device)
         self.graph = graph_workspace(sim.real, 6, self.slots, n, blocks, fill, sim.device)
         ws = self.workspace = self.parts.Workspace()
-        number = np.full(sim.model.num_bodies, -1, dtype=np.int32)
-        number[self.movable] = np.arange(n)
-        ws.number = wp.array(number, dtype=int, device=sim.device)
-        ws.body = wp.array(self.movable.astype(np.int32), dtype=int, device=sim.device)
+        ws.nodes, ws.body, ws.velocity = sim.ints(nodes), sim.ints(body), sim.ints(velocity)
         t, vec6 = scalar_types(sim.real), wp.types.vector(length=6, dtype=sim.real)
         for name, width, dtype in (
             ("begin", n + 1, int),
-            ("contact", 2 * contacts, int),
+            ("contact", 2 * most * contacts, int),
             ("matrix", contacts, t.mat33),
             ("shift", contacts, t.vec3),
             ("change", n, vec6),
@@ -229,7 +241,7 @@ class VelocityPivoting(Method):
             sim.launch(self.kernel, [*scene, sim.dt, *sim.law.row_arguments, *limits, sim.next_velocity, *lists, *answer])
         else:
             tail = [wp.vec3i(self.LIMIT, *self.NEWTON_LIMITS), sim.sign_tolerance, sim.iterations, sim.reason]
-            inputs = [sim.bodies, sim.rows, todo, number, self.graph, self.workspace, *tail]
+            inputs = [sim.mechanics, sim.rows, todo, number, self.graph, self.workspace, *tail]
             wp.launch_tiled(self.kernel, dim=[self.slots], inputs=inputs, block_dim=LANES, device=sim.device)
 
 
@@ -239,7 +251,7 @@ class BlockPGS(Method):
     SWEEPS = 50
 
     def __init__(self, model: Model, real: Any, law: Law):
-        self.kernel = pgs.make(real)
+        self.kernel = pgs.make(real, model.articulated)
 
     def prepare(self, sim: Simulator) -> None:
         """Nothing to allocate: the velocities are the simulator's."""
@@ -248,7 +260,7 @@ class BlockPGS(Method):
         # Sweeps end where no impulse changes a velocity by more than a hundredth of what certifies an answer.
         sim.launch(
             self.kernel,
-            [sim.bodies, sim.rows, todo, number, self.SWEEPS, 0.01 * sim.tolerance, sim.next_velocity, sim.iterations, sim.reason],
+            [sim.mechanics, sim.rows, todo, number, self.SWEEPS, 0.01 * sim.tolerance, sim.next_velocity, sim.iterations, sim.reason],
         )
 
 

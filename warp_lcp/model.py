@@ -12,12 +12,22 @@ FREE       7    6    q: pose of the body frame in the world (x y z qx qy qz qw);
                      between body frame and centre of mass.
 KINEMATIC  7    6    the same coordinates, prescribed: the body moves with v whatever touches it
 FIXED      0    0    rigidly attached to its parent
+REVOLUTE   1    1    angle about x of the joint's frame [rad]
+PRISMATIC  1    1    way along x [m]
+SPHERICAL  4    3    q: quaternion (x y z w) from the frame on the parent to that on the body; v: angular velocity relative to the
+                     parent, axes of the frame on the body
+UNIVERSAL  2    2    angles about x, then about y as turned by the first
+PLANAR     3    3    ways along x and y, angle about z
+D6         n    n    any of the ways tx ty tz, then angles about rx ry rz, each as turned by those before it
 ========== ==== ==== ==========================================================================================
+
+The frame of a joint on its parent and that on its body coincide where q is zero.
 """
 
 from __future__ import annotations
 
 import enum
+import heapq
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,6 +39,34 @@ class JointType(enum.IntEnum):
     FREE = 0
     KINEMATIC = 1
     FIXED = 2
+    REVOLUTE = 3
+    PRISMATIC = 4
+    SPHERICAL = 5
+    UNIVERSAL = 6
+    PLANAR = 7
+    D6 = 8
+
+
+#: What each joint leaves free: ways (t) and angles (r) along the axes of its frame on the parent, in the order of its coordinates.
+JOINT_AXES: dict[JointType, tuple[str, ...]] = {
+    JointType.FIXED: (),
+    JointType.REVOLUTE: ("rx",),
+    JointType.PRISMATIC: ("tx",),
+    JointType.SPHERICAL: ("rx", "ry", "rz"),
+    JointType.UNIVERSAL: ("rx", "ry"),
+    JointType.PLANAR: ("tx", "ty", "rz"),
+}
+
+
+class DofKind(enum.IntEnum):
+    """How a velocity moves what hangs on it (kernels/tree.py)."""
+
+    LINEAR = 0
+    ANGULAR = 1
+    BALL = 2  #: the first of three
+    BALL_ON = 3
+    FREE = 4
+    PRESCRIBED = 5
 
 
 class ShapeType(enum.IntEnum):
@@ -90,6 +128,51 @@ class Material:
 
 
 @dataclass(frozen=True)
+class Drive:
+    """What pulls a joint's coordinate: stiffness (target - q) + damping (target_velocity - dq/dt), no more than max_force.
+
+    N, m and s, or N m, rad and s. It is implicit: stiff gains are as stable as soft ones.
+    """
+
+    stiffness: float = 0.0
+    damping: float = 0.0
+    max_force: float = np.inf
+    target: float = 0.0
+    target_velocity: float = 0.0
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A joint between two bodies of the trees, -1 = the world, as constraints on their motion (eqs. 14, 25).
+
+    Attributes:
+        name: of the joint. bodies: a, b. frames: [2, 7] of the joint in their frames, which coincide as far as it holds them.
+        ways, turns: which of the axes of frame a are held.
+        distance: None, or the least and greatest distance of the frames' origins, which is then all that is held [m].
+    """
+
+    name: str
+    bodies: tuple[int, int]
+    frames: np.ndarray
+    ways: tuple[bool, bool, bool]
+    turns: tuple[bool, bool, bool]
+    distance: tuple[float, float] | None = None
+
+
+def parents_first(parent: list[int]) -> list[int]:
+    """Bodies in their own order but for children that come before their parents, which wait for them."""
+    children: dict[int, list[int]] = {}
+    for b, p in enumerate(parent):
+        children.setdefault(p, []).append(b)
+    ready, order = list(children.get(-1, [])), []
+    while ready:
+        order.append(heapq.heappop(ready))
+        for child in children.get(order[-1], []):
+            heapq.heappush(ready, child)
+    return order
+
+
+@dataclass(frozen=True)
 class Ignored:
     """Something in a scene file that is not simulated: where, what, and why that is so."""
 
@@ -127,8 +210,14 @@ class Model:
         body_parent: [B] index of the parent body, -1 = world.
         joint_type: [B] :class:`JointType` of the joint above each body.
         joint_pose: [B, 7] frame of that joint in the parent's frame (identity under a FREE or KINEMATIC joint).
+        joint_child_pose: [B, 7] frame of that joint in the body's own frame (likewise).
         q_start, v_start: [B] first coordinate of each body in q and v.
         q0: [nq] initial configuration. v0: [nv] initial velocity.
+        dof_body: [nv] body above which each velocity is. dof_kind: [nv] :class:`DofKind`. dof_axis: [nv, 3] in the joint's frame.
+        armature: [nv] kg or kg m^2, added to the mass matrix. damping: [nv] N s/m or N m s, force by joint velocity.
+        joint_friction: [nv] N or N m, dry friction. limit: [nv, 2] m or rad, least and greatest coordinate, infinite where there is none.
+        drive: [nv, 5] stiffness, damping, greatest force, target and target velocity of a :class:`Drive`.
+        loops: joints that close loops, and distances.
         mass: [B] kg. com: [B, 3] centre of mass in the body frame, m.
         inertia: [B, 3, 3] about the centre of mass, body axes, kg m^2.
         shape_names, shape_type, shape_body: [S] name, :class:`ShapeType` and owner (-1 = world).
@@ -149,10 +238,20 @@ class Model:
     body_parent: np.ndarray
     joint_type: np.ndarray
     joint_pose: np.ndarray
+    joint_child_pose: np.ndarray
     q_start: np.ndarray
     v_start: np.ndarray
     q0: np.ndarray
     v0: np.ndarray
+    dof_body: np.ndarray
+    dof_kind: np.ndarray
+    dof_axis: np.ndarray
+    armature: np.ndarray
+    damping: np.ndarray
+    joint_friction: np.ndarray
+    limit: np.ndarray
+    drive: np.ndarray
+    loops: tuple[Loop, ...]
     mass: np.ndarray
     com: np.ndarray
     inertia: np.ndarray
@@ -196,7 +295,37 @@ class Model:
     @property
     def dofs(self) -> int:
         """Degrees of freedom: velocities that forces can change (those of kinematic bodies are prescribed)."""
-        return 6 * int(np.count_nonzero(self.joint_type == JointType.FREE))
+        return int(np.count_nonzero(self.dof_kind != DofKind.PRESCRIBED))
+
+    @property
+    def articulated(self) -> bool:
+        """Does a body move on another one, or on a joint on the world?"""
+        return bool((self.joint_type > JointType.FIXED).any() or (self.body_parent >= 0).any() or self.loops)
+
+    @property
+    def movable(self) -> np.ndarray:
+        """[B + 1] bodies that forces move, by their own joint or one between them and the root; the last one is the world, -1."""
+        moves = np.r_[(self.joint_type != JointType.KINEMATIC) & (self.joint_type != JointType.FIXED), False]
+        for b in self.order:
+            moves[b] |= moves[self.body_parent[b]]
+        return moves
+
+    @property
+    def order(self) -> np.ndarray:
+        """[B] bodies, each after its parent, otherwise in their own order; coordinates come in the same."""
+        return np.array(parents_first(self.body_parent.tolist()), dtype=np.int32)
+
+    @property
+    def dof_before(self) -> np.ndarray:
+        """[nv] the velocity before each one on its path from the root, -1 = none; those of kinematic bodies are on no path."""
+        before = np.full(self.nv, -1, dtype=np.int32)
+        last = np.full(self.num_bodies + 1, -1, dtype=np.int32)
+        for b in self.order:
+            last[b] = last[self.body_parent[b]]
+            for i in np.flatnonzero(self.dof_body == b):
+                if self.dof_kind[i] != DofKind.PRESCRIBED:
+                    before[i], last[b] = last[b], i
+        return before
 
     @property
     def pair_slots(self) -> np.ndarray:
@@ -222,8 +351,7 @@ class Model:
     @property
     def bodies_meet(self) -> bool:
         """Can two free bodies touch?"""
-        free = np.r_[self.joint_type == JointType.FREE, False]  # the last one is the world, -1
-        return bool(free[self.shape_body[self.pairs]].all(axis=-1).any())
+        return bool(self.movable[self.shape_body[self.pairs]].all(axis=-1).any())
 
     @property
     def max_contacts(self) -> int:
@@ -232,4 +360,4 @@ class Model:
         All slots while there are at most 64, else 24 per movable body if that is more: slots grow with the square of the
         bodies, points that touch at one time do not. What does not fit is dropped and flagged.
         """
-        return min(self.num_slots, max(64, 24 * (self.dofs // 6)))
+        return min(self.num_slots, max(64, 24 * int(np.count_nonzero(self.movable))))

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from . import articulation
 from .errors import SimulationError, WarpLcpError, positive_number, whole_number
-from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, reset, restitution
+from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, joint_rows, reset, restitution, tree
 from .kernels.types import scalar_types
 from .laws import Law
 from .methods import METHODS, chosen
@@ -81,6 +82,21 @@ class Contacts:
     state: wp.array
 
 
+@dataclass(frozen=True)
+class Control:
+    """What drives the joints, writable on the device; stays until changed. E environments, by velocity, as ``v``.
+
+    Attributes:
+        position: [E, nv] m or rad, target of each drive; not looked at where a velocity has no drive.
+        velocity: [E, nv] m/s or rad/s, its target velocity.
+        force: [E, nv] N or N m, applied to each joint, on top of what drives do.
+    """
+
+    position: wp.array
+    velocity: wp.array
+    force: wp.array
+
+
 class Simulator:
     """N environments of one Model.
 
@@ -107,6 +123,7 @@ class Simulator:
         q, v: [E, nq], [E, nv] state, writable in place.
         q0, v0: the state that :meth:`reset` copies back, writable.
         wrench: [E, B] spatial vector, force [N] and torque [N m] at the centre of mass, world axes; stays until changed.
+        control: :class:`Control` of the joints; None in a model without.
         status: [E] :class:`Status` bits of the last step() or rollout() call, or-ed over its steps.
         residual: [E] m/s, largest violation of the law that was solved, of the last step.
         residual_energy: [E] J, unit-consistent energy error of the last step.
@@ -137,6 +154,8 @@ class Simulator:
         _choice("method", method, tuple(METHODS))
         _choice("precision", precision, tuple(PRECISIONS))
         _choice("integrator", integrator, INTEGRATORS)
+        if model.articulated and integrator == "midpoint":
+            raise WarpLcpError("integrator 'midpoint' does not know joints yet; choose 'euler'")
         self.model, self.num_envs, self.dt = model, whole_number("num_envs", num_envs, 1), positive_number("dt", dt, "s")
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
@@ -199,7 +218,7 @@ class Simulator:
             self._raise_for_status()
 
     def reset(self, mask: Any = None) -> None:
-        """Copy q0, v0 back and clear every hidden buffer (contact history, applied wrenches, status).
+        """Copy q0, v0 back and clear every hidden buffer (contact history, applied wrenches, status); drives have the model's targets.
 
         Args:
             mask: [E] bool, environments to reset, numpy or Warp; None = all.
@@ -216,6 +235,9 @@ class Simulator:
         inputs = [mask, self.q0, self.v0, self.q, self.v, self.wrench, self.bodies, self.rows, self.slots]
         inputs += [self.residual, self.residual_energy, self.iterations, self.status]
         wp.launch(self._kernels.reset, dim=self.num_envs, inputs=inputs, device=self.device)
+        if self.model.articulated:
+            drive = [self._constant(self.model.drive[:, k], self.real) for k in (3, 4)]
+            wp.launch(self._kernels.reset_control, dim=self.num_envs, inputs=[mask, *drive, self.mechanics], device=self.device)
 
     # ------------------------------------------------------------------------------------------- parameters and views
 
@@ -282,7 +304,7 @@ class Simulator:
                     setattr(bounces, name, wp.zeros(self.num_envs, dtype=dtype, device=self.device))
             bounces.again = wp.zeros(1, dtype=int, device=self.device)
             self._methods[0].take_rows()
-            self._kernels.contact_rows = contacts.make(self.real).contact_rows
+            self._kernels.contact_rows = contacts.make(self.real, self.model.articulated).contact_rows
             needed = [k.bounce, k.judge, k.settle, self._kernels.contact_rows, self._methods[0].kernel]
             self._load([kernel for kernel in needed if kernel not in self.kernels])
             self._graphs.clear()
@@ -330,13 +352,17 @@ class Simulator:
         return self.bodies.velocity
 
     def _refresh_bodies(self) -> None:
-        self.launch(self._kernels.kinematics, [self.q, self.v, self.topology, self.bodies], self.model.num_bodies)
+        if self.model.articulated:
+            self.launch(self._kernels.kinematics, [self.q, self.v, self.topology, self.parameters, self.mechanics, self.bodies])
+        else:
+            self.launch(self._kernels.kinematics, [self.q, self.v, self.topology, self.bodies], self.model.num_bodies)
 
     @property
     def contacts(self) -> Contacts:
         """Contacts of the last step (views of the device arrays)."""
         r = self.rows
-        return Contacts(r.count, r.body, r.point, r.gap, r.frame, r.impulse, r.velocity, r.state)
+        touching = self.mechanics.touching if self.model.articulated and len(self.mechanics.row_kind) else r.count
+        return Contacts(touching, r.body, r.point, r.gap, r.frame, r.impulse, r.velocity, r.state)
 
     def _raise_for_status(self) -> None:
         status = self.status.numpy() & ~INFORMATIVE
@@ -351,8 +377,11 @@ class Simulator:
     def _step_kernels(self) -> None:
         """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back."""
         k, h, b, scene = self._kernels, self.dt, self.model.num_bodies, [self.topology, self.parameters]
-        self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
-        self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
+        self._refresh_bodies()
+        if self.model.articulated:
+            self.launch(k.free_motion, [*scene, self.mechanics, self.wrench, self.q, self.v, h, self.bodies])
+        else:
+            self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
         if self.model.bounded:
             self.launch(k.bounds, [self.topology, self.bodies, h], len(self.model.shape_body))
         for kernel, first, number in self._pair_kernels:
@@ -361,7 +390,9 @@ class Simulator:
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
         if not self._methods[0].makes_rows:
             lanes = 1 if self.device.is_cpu else self.model.max_contacts
-            self.launch(k.contact_rows, [*scene, self.bodies, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
+            self.launch(k.contact_rows, [*scene, self.mechanics, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
+        if self.model.articulated and len(self.mechanics.row_kind):
+            self.launch(k.joint_rows, [self.mechanics, self.bodies, self.q, self.v, h, self.rows])
         if self.bounces is not None:
             self.launch(
                 k.bounce, [*scene, h, self.tolerance, int(self.integrator == "midpoint"), self.rows, self.bounces], self.model.max_contacts
@@ -369,12 +400,14 @@ class Simulator:
         self._solve_kernels(self.everyone, self.num_everyone, self.status)
         if self.bounces is not None:
             self._judge_kernels()
-        if self.integrator == "midpoint":
+        if self.model.articulated:
+            self.launch(k.integrate, [self.topology, self.mechanics, self.bodies, h, self.q, self.v], b)
+        elif self.integrator == "midpoint":
             self.launch(k.guard, [self.parameters, self.bodies, self.rows, self.next_velocity, h, self.tolerance, self.rounding])
             self.launch(k.integrate_midpoint, [*scene, self.bodies, self.next_velocity, self.wrench, h, self.q, self.v], b)
         else:
             self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
-        self.launch(k.kinematics, [self.q, self.v, self.topology, self.bodies], b)
+        self._refresh_bodies()
 
     def _solve_kernels(self, todo: wp.array, number: wp.array, status: wp.array) -> None:
         """The environments todo[:number] by the first method, those left by the next, and so on; each answer certified."""
@@ -395,7 +428,7 @@ class Simulator:
         left, number_left = (todo, number) if last else (self.queues[i], self.queued[i : i + 1])
         lists = [todo, number, left, number_left]
         answer = [*lists, self.unsolved, self.reason, self.best_residual, self.residual, self.residual_energy, status]
-        problem = [self.bodies, self.dt, self.tolerance, i, int(last), self.next_velocity, self.rows, self.slots]
+        problem = [self.mechanics, self.dt, self.tolerance, i, int(last), self.next_velocity, self.rows, self.slots]
         self.launch(self._kernels.certify, [*problem, *answer])
         if not last:
             self._where(number_left, lambda: self._solve_with(i + 1, left, number_left, status))
@@ -449,6 +482,9 @@ class Simulator:
             return wp.zeros((self.num_envs, n), dtype=dtype, device=self.device)
         return wp.zeros((n, self.num_envs), dtype=dtype, device=self.device).transpose()
 
+    def ints(self, values: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=int, device=self.device)
+
     def _constant(self, values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(np.ascontiguousarray(values, dtype=self._numpy_real), dtype=dtype, device=self.device)
 
@@ -456,11 +492,10 @@ class Simulator:
         t, m, e = self._types, self.model, self.num_envs
         b, c, r = m.num_bodies, m.num_slots, m.max_contacts
 
-        def ints(values: np.ndarray) -> wp.array:
-            return wp.array(np.ascontiguousarray(values, dtype=np.int32), dtype=int, device=self.device)
-
+        ints = self.ints
         topology = self.topology = t.Topology()
         topology.joint_type, topology.q_start, topology.v_start = ints(m.joint_type), ints(m.q_start), ints(m.v_start)
+        topology.movable = ints(m.movable[:-1])
         topology.joint_pose = self._constant(m.joint_pose, t.transform)
         topology.shape_body = ints(m.shape_body)
         topology.shape_pose = self._constant(m.shape_pose, t.transform)
@@ -487,6 +522,12 @@ class Simulator:
         bundle.hit = self._array(b if m.bodies_meet else 0, self.real)
         bundle.alert = wp.zeros(e if m.bodies_meet else 0, dtype=self.real, device=self.device)
         self.next_velocity = self._array(b, t.spatial)
+        #: What solvers know of the bodies: the bodies themselves, or the trees they hang in.
+        self.mechanics: Any = bundle
+        self.control: Control | None = None
+        if m.articulated:
+            trees = self.mechanics = articulation.arrays(self, tree.functions(self.real).Trees)
+            self.control = Control(trees.target, trees.target_rate, trees.force)
 
         slots = self.slots = t.Slots()
         slots.point, slots.normal = self._array(c, t.vec3), self._array(c, t.vec3)
@@ -496,6 +537,9 @@ class Simulator:
         slots.last_feature.fill_(-1)
 
         rows = self.rows = t.Contacts()
+        rows.room = r
+        if m.articulated:
+            r += len(self.mechanics.row_kind)
         rows.count = wp.zeros(e, dtype=int, device=self.device)
         rows.body = self._array(r, wp.vec2i)
         rows.slot, rows.closed, rows.state, rows.directions = (self._array(r, int) for _ in range(4))
@@ -547,13 +591,14 @@ class Simulator:
 
 def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
     """Kernels of the stages by name, and (kernel, first pair, number of pairs) for each kind of pair in the model."""
-    body, rows, motion = bodies.make(real), contacts.make(real), integrate.make(real)
+    rows, motion = contacts.make(real, model.articulated), integrate.make(real)
+    body = tree.make(real) if model.articulated else bodies.make(real)
     stages = SimpleNamespace(
         kinematics=body.kinematics,
         free_motion=body.free_motion,
         combine_pairs=rows.combine_pairs,
         select_contacts=rows.select_contacts,
-        certify=certify.make(real),
+        certify=certify.make(real, model.articulated),
         reset=reset.make(real),
     )
     if model.bounded:
@@ -563,7 +608,11 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     if model.bounces:
         rebound = restitution.make(real)
         stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
-    if integrator == "midpoint":
+    if model.articulated and articulation.rows(model):
+        stages.joint_rows = joint_rows.make(real)
+    if model.articulated:
+        stages.integrate, stages.reset_control = body.integrate, body.reset_control
+    elif integrator == "midpoint":
         stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
     else:
         stages.integrate = motion.integrate

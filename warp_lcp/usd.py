@@ -38,6 +38,7 @@ import numpy as np
 from .builder import ModelBuilder, capsule_solid, rotation_matrix
 from .errors import MissingExtra, ModelError, SceneError
 from .model import Ignored, JointType, Material, Model, Report
+from .usd_joints import JointReader
 
 CONTACT_ATTRIBUTES = {
     "warpLcp:normalStiffness": "normal_stiffness",
@@ -306,6 +307,7 @@ class _Reader:
         self.shapes: list[_Shape] = []
         self.masses: list[float | None] = []
         self.unbound: list[str] = []
+        self.all_joints: set[Any] = set()
 
     # -- the whole --------------------------------------------------------------------------------------------------
 
@@ -325,7 +327,7 @@ class _Reader:
             self._body(path, desc)
         for path, desc in active:
             self._shape(path, desc)
-        joints = self._joints()
+        joints = JointReader(self).read()
         self._filter()
         self._other_prims()
         if self.unbound:
@@ -743,23 +745,6 @@ class _Reader:
     def _sorted(self, entries: list[Ignored]) -> list[Ignored]:
         place = {str(p): i for p, i in self.order.items()}
         return sorted(entries, key=lambda e: place.get(e.path, -1))
-
-    def _joints(self) -> list[Any]:
-        """Paths of enabled joints, all of them unsupported."""
-        enabled = []
-        self.all_joints = {p for kind in self._kinds("Joint") for p, _ in self._descs(kind)}
-        for path in sorted(self.all_joints, key=lambda p: self.order.get(p, 0)):
-            prim = self.stage.GetPrimAtPath(path)
-            if self.px.UsdPhysics.Joint(prim).GetJointEnabledAttr().Get():
-                enabled.append(path)
-                why = "joints are not supported yet; set physics:jointEnabled = false to go without"
-                self.unsupported.append(Ignored(str(path), str(prim.GetTypeName()), why))
-            else:
-                self._repeat(path, str(prim.GetTypeName()), "physics:jointEnabled = false")
-        for path, desc in self._descs("Articulation"):
-            if not set(desc.articulatedJoints) & set(enabled):
-                self.ignored.append(Ignored(str(path), "articulation root", "no enabled joint belongs to it"))
-        return enabled
 
     def _other_prims(self) -> None:
         skip = None  # subtree of a point instancer

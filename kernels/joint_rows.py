@@ -1,0 +1,327 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows that joints put behind those of the contacts: limits, drives and dry friction of one velocity, and joints that close loops.
+
+Each is a contact with another Jacobian, three rows that the same laws and methods solve:
+
+    of a velocity   n: a limit, u_n + phi / h >= 0;  t1: a drive that gives no more than its greatest force F, |p| <= h F;
+                    t2: dry friction, |p| <= h F.  All three along the velocity's axis.
+    of a loop       three ways, or turns, between two frames that the joint does not let happen; any impulse (eqs. 14, 25).
+    of a distance   n: no closer, or no further, than a distance.
+
+A row that has nothing to do has a Jacobian of zero. Rows of angles are scaled by the radius of gyration of what hangs on the joint, so that
+they are velocities [m/s] and impulses [N s] like all others.
+
+A drive is implicit, p = -h (k (q + h u - q*) + b (u - u*)): a row with relaxation 1 / (h (h k + b)). One that may give any force
+is no row but a part of M (kernels/tree.py).
+"""
+
+import functools
+
+import warp as wp
+
+from . import tree
+from .tree import CLOSER, LIMIT_HIGH, LINEAR, LOOP_TURN, LOOP_WAY
+from .types import HELD, OPTIONS, scalar_types
+
+# Stiffness and damping of limits and distances for each kg that they hold: Table 1. A loop is as stiff, without damping: what opens it
+# in a step is taken back in the next.
+STIFFNESS = wp.constant(1.0e10)
+DAMPING = wp.constant(1.0e8)
+# Dry friction gives way by this part of the velocity that it stops in a step.
+FRICTION_RELAXATION = wp.constant(1.0e-9)
+# What is further from where it should be is corrected no faster than this [m/s].
+MAX_CORRECTION = wp.constant(3.0)
+# A row of a loop along which the joints of its bodies let nothing move, but for this part of what they would do without, is left out.
+IMMOBILE = wp.constant(1.0e-10)
+
+
+@functools.cache
+def make(real):
+    """Kernel ``joint_rows``; launch with dim (E), after the contacts' rows."""
+    t = scalar_types(real)
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    Bodies, Contacts = t.Bodies, t.Contacts
+    forest = tree.functions(real)
+    Trees, divide, halve, product = forest.Trees, forest.divide, forest.halve, forest.product
+
+    @wp.func
+    def axis_of(turn: mat33, k: int) -> vec3:
+        """Column k of a rotation: where it carries axis k."""
+        return vec3(turn[0, k], turn[1, k], turn[2, k])
+
+    @wp.func
+    def spring(phi: real, h: real, w: real, damping: real):
+        """Relaxation and shift of a row that holds phi [m] at zero, w = J M^-1 J^T (eqs. 40 and 41)."""
+        k = real(STIFFNESS)
+        eps = w / (h * (h * k + damping))
+        d = k * phi / (h * k + damping)
+        return eps, wp.clamp(d, -real(MAX_CORRECTION), real(MAX_CORRECTION))
+
+    @wp.func
+    def stop(phi: real, h: real, w: real):
+        """The same for a row that phi may leave: until it is reached u + phi / h >= 0."""
+        eps, d = spring(phi, h, w, real(DAMPING))
+        if phi > real(0.0):
+            d = phi / h
+        return eps, d
+
+    @wp.func
+    def turn_error(a: mat33, b: mat33, held: wp.vec3i):
+        """Axes, in world axes, about which frame b is turned from a although they are held, and by how much [rad]; rows, zero where not."""
+        number = held[0] + held[1] + held[2]
+        frame = mat33()
+        angle = vec3()
+        if number == 3:
+            # e = sum of a_k x b_k / 2: the axis times the sine of the angle; beyond a right angle its length stays where it is.
+            e = real(0.5) * (wp.cross(axis_of(a, 0), axis_of(b, 0)) + wp.cross(axis_of(a, 1), axis_of(b, 1)))
+            e += real(0.5) * wp.cross(axis_of(a, 2), axis_of(b, 2))
+            frame = wp.transpose(a)
+            angle = frame * e
+        elif number == 2:
+            free = int(0)
+            for k in range(3):
+                if held[k] == 0:
+                    free = k
+            e = wp.cross(axis_of(a, free), axis_of(b, free))
+            for k in range(3):
+                if k != free:
+                    for c in range(3):
+                        frame[k, c] = a[c, k]
+                    angle[k] = wp.dot(axis_of(a, k), e)
+        elif number == 1:
+            one = int(0)
+            for k in range(3):
+                if held[k] != 0:
+                    one = k
+            # Of the two free axes the first is carried by a, the second by b: they stay perpendicular.
+            first = (one + 1) % 3
+            second = (one + 2) % 3
+            if first > second:
+                first = (one + 2) % 3
+                second = (one + 1) % 3
+            axis = wp.cross(axis_of(a, first), axis_of(b, second))
+            angle[one] = -wp.dot(axis_of(a, first), axis_of(b, second))
+            size = wp.length(axis)
+            for c in range(3):
+                frame[one, c] = axis[c] / size
+        return frame, angle
+
+    @wp.func
+    def write(
+        contacts: Contacts,
+        env: int,
+        n: int,
+        k: int,
+        body: wp.vec2i,
+        point: vec3,
+        frame: mat33,
+        w: vec3,
+        eps: vec3,
+        shift: vec3,
+        free: vec3,
+        bound: vec2,
+        directions: int,
+        state: int,
+    ):
+        contacts.slot[env, n] = -1 - k
+        contacts.body[env, n] = body
+        contacts.point[env, n] = point
+        contacts.gap[env, n] = real(0.0)
+        contacts.closed[env, n] = 1
+        contacts.frame[env, n] = frame
+        contacts.inv_mass[env, n] = w
+        contacts.relaxation[env, n] = eps
+        contacts.shift[env, n] = shift
+        contacts.free[env, n] = free + shift
+        contacts.mu[env, n] = vec2()
+        contacts.bound[env, n] = bound
+        contacts.directions[env, n] = directions
+        contacts.damping[env, n] = real(0.0)
+        contacts.impulse[env, n] = vec3()
+        contacts.state[env, n] = state
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def joint_rows(
+        trees: Trees,
+        bodies: Bodies,
+        q: wp.array2d(dtype=real),
+        v: wp.array2d(dtype=real),
+        h: real,
+        contacts: Contacts,
+        stride: int,
+    ):
+        start, _ = wp.tid()
+        for env in range(start, contacts.count.shape[0], stride):
+            n = contacts.count[env]
+            trees.touching[env] = n
+            for k in range(trees.row_kind.shape[0]):
+                kind = trees.row_kind[k]
+                i = trees.row_velocity[k]
+                if i >= 0:
+                    body = trees.row_owner[k]
+                    length = real(1.0)
+                    if trees.kind[i] != LINEAR:
+                        length = wp.sqrt(trees.matrix[env, trees.row[i]] / trees.mass[env, body])
+                    sign = real(1.0)
+                    if kind == LIMIT_HIGH:
+                        sign = real(-1.0)
+                    drive = trees.row_drive[env % trees.row_drive.shape[0], k]
+                    friction = trees.row_friction[env % trees.row_friction.shape[0], k]
+                    position = q[env, trees.coordinate[i]]
+                    gap = length * sign * (position - trees.row_limit[k])
+                    fastest = length * wp.max(wp.abs(v[env, i]), wp.abs(trees.free[env, i]))
+                    near = gap < real(2.0) * h * fastest + real(1.0e-6) * length
+                    stiff = h * (h * drive[0] + drive[1])
+                    scale = vec3()
+                    if near:
+                        scale[0] = sign * length
+                    if stiff > real(0.0):
+                        scale[1] = length
+                    if friction > real(0.0):
+                        scale[2] = length
+                    if scale[0] != real(0.0) or scale[1] != real(0.0) or scale[2] != real(0.0):
+                        first = (2 * n + 1) * trees.longest
+                        j = trees.last[body]
+                        while j >= 0:
+                            trees.half[env, first + trees.depth[j]] = vec3()
+                            j = trees.before[j]
+                        trees.half[env, first + trees.depth[i]] = scale
+                        divide(trees, env, first, body)
+                        trees.row_scale[env, k] = scale
+                        contacts.body[env, n] = wp.vec2i(-1, body)
+                        w = wp.get_diag(product(trees.shared, trees.half, contacts.body, trees.longest, env, n, n))
+                        eps = vec3(real(1.0))
+                        shift = vec3()
+                        free = trees.free[env, i] * scale
+                        state = int(0)
+                        if near:
+                            eps_n, d = stop(gap, h, w[0])
+                            eps[0] = eps_n
+                            shift[0] = d
+                            if free[0] + d < real(0.0):
+                                state = 1
+                        else:
+                            shift[0] = real(1.0)
+                        if stiff > real(0.0):
+                            eps[1] = length * length / stiff
+                            pull = h * (drive[0] * (trees.target[env, i] - position) + drive[1] * trees.target_rate[env, i])
+                            shift[1] = -length * pull / stiff
+                        if friction > real(0.0):
+                            eps[2] = real(FRICTION_RELAXATION) * w[2]
+                        bound = vec2(h * drive[2] / length, h * friction / length)
+                        write(
+                            contacts,
+                            env,
+                            n,
+                            k,
+                            wp.vec2i(-1, body),
+                            bodies.com[env, body],
+                            wp.identity(n=3, dtype=real),
+                            w,
+                            eps,
+                            shift,
+                            free,
+                            bound,
+                            2,
+                            state,
+                        )
+                        n += 1
+                else:
+                    pair = trees.row_body[k]
+                    pose_a = trees.row_pose[k, 0]
+                    pose_b = trees.row_pose[k, 1]
+                    if pair[0] >= 0:
+                        pose_a = bodies.pose[env, pair[0]] * pose_a
+                    if pair[1] >= 0:
+                        pose_b = bodies.pose[env, pair[1]] * pose_b
+                    a = wp.quat_to_matrix(wp.transform_get_rotation(pose_a))
+                    b = wp.quat_to_matrix(wp.transform_get_rotation(pose_b))
+                    point = wp.transform_get_translation(pose_b)
+                    apart = point - wp.transform_get_translation(pose_a)
+                    held = trees.row_held[k]
+                    frame = mat33()
+                    phi = vec3()
+                    directions = int(HELD)
+                    needed = bool(True)
+                    if kind == LOOP_WAY:
+                        for r in range(3):
+                            if held[r] != 0:
+                                for c in range(3):
+                                    frame[r, c] = a[c, r]
+                        phi = frame * apart
+                    elif kind == LOOP_TURN:
+                        axes, angle = turn_error(a, b, held)
+                        frame = trees.row_length[k] * axes
+                        phi = trees.row_length[k] * angle
+                    else:
+                        directions = 0
+                        distance = wp.length(apart)
+                        away = real(-1.0)
+                        if kind == CLOSER:
+                            away = real(1.0)
+                        along = apart * (away / wp.max(distance, real(1.0e-9)))
+                        for c in range(3):
+                            frame[0, c] = along[c]
+                        phi[0] = away * (distance - trees.row_limit[k])
+                    # Velocities of b relative to a there, present and free.
+                    u = vec3()
+                    u_free = vec3()
+                    for side in range(2):
+                        body = pair[side]
+                        if body >= 0:
+                            s = real(2 * side - 1)
+                            present = wp.spatial_bottom(bodies.velocity[env, body])
+                            ahead = wp.spatial_bottom(bodies.free_velocity[env, body])
+                            if kind != LOOP_TURN:
+                                arm = point - bodies.com[env, body]
+                                present = wp.spatial_top(bodies.velocity[env, body]) + wp.cross(present, arm)
+                                ahead = wp.spatial_top(bodies.free_velocity[env, body]) + wp.cross(ahead, arm)
+                            u += s * present
+                            u_free += s * ahead
+                    if directions == 0:
+                        needed = phi[0] < real(2.0) * h * wp.max(wp.length(u), wp.length(u_free)) + real(1.0e-6)
+                    if needed:
+                        for side in range(2):
+                            body = pair[side]
+                            if body >= 0:
+                                if kind == LOOP_TURN:
+                                    first = (2 * n + side) * trees.longest
+                                    j = trees.last[body]
+                                    while j >= 0:
+                                        trees.half[env, first + trees.depth[j]] = trees.angular[env, j]
+                                        j = trees.before[j]
+                                    divide(trees, env, first, body)
+                                else:
+                                    halve(trees, env, 2 * n + side, body, point)
+                        contacts.body[env, n] = pair
+                        mobility = product(trees.shared, trees.half, contacts.body, trees.longest, env, n, n)
+                        w_row = wp.get_diag(frame * mobility * wp.transpose(frame))
+                        eps = vec3(real(1.0))
+                        shift = vec3()
+                        if directions == 0:
+                            eps_n, d = stop(phi[0], h, w_row[0])
+                            eps[0] = eps_n
+                            shift[0] = d
+                        else:
+                            alone = real(0.0)  # what the bodies would have without their joints
+                            for side in range(2):
+                                if pair[side] >= 0:
+                                    alone += bodies.inv_mass[env, pair[side]]
+                            for r in range(3):
+                                if w_row[r] > real(IMMOBILE) * alone:
+                                    eps_r, d_r = spring(phi[r], h, w_row[r], real(0.0))
+                                    eps[r] = eps_r
+                                    shift[r] = d_r
+                                else:
+                                    for c in range(3):
+                                        frame[r, c] = real(0.0)
+                                    w_row[r] = real(0.0)
+                        free = frame * u_free
+                        state = int(0)
+                        if free[0] + shift[0] < real(0.0):
+                            state = 1
+                        write(contacts, env, n, k, pair, point, frame, w_row, eps, shift, free, vec2(), directions, state)
+                        n += 1
+            contacts.count[env] = n
+
+    return joint_rows

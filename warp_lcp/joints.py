@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From bodies and the joints between them to a forest of kinematic trees: which joint carries which body, and where it stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .errors import ModelError
+from .model import DofKind, JointType, Loop, parents_first
+
+AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
+
+
+@dataclass
+class Joint:
+    """A joint between two bodies, -1 = the world; ``axes`` are free. Frames (x y z qx qy qz qw) in the bodies' own frames."""
+
+    name: str
+    type: JointType
+    parent: int
+    child: int
+    parent_frame: np.ndarray
+    child_frame: np.ndarray
+    axes: tuple[str, ...]
+    armature: np.ndarray
+    damping: np.ndarray
+    friction: np.ndarray
+    limit: np.ndarray
+    drive: np.ndarray
+    distance: tuple[float, float] | None = None
+    collide: bool = False
+    loop: bool = False
+
+
+def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Product of quaternions (x y z w)."""
+    av, aw, bv, bw = a[:3], a[3], b[:3], b[3]
+    return np.r_[aw * bv + bw * av + np.cross(av, bv), aw * bw - av @ bv]
+
+
+def conjugate(a: np.ndarray) -> np.ndarray:
+    return np.r_[-a[:3], a[3]]
+
+
+def rotate(a: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return x + 2.0 * np.cross(a[:3], np.cross(a[:3], x) + a[3] * x)
+
+
+def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Pose b in the frame of pose a."""
+    turn = multiply(a[3:], b[3:])
+    return np.r_[a[:3] + rotate(a[3:], b[:3]), turn / np.linalg.norm(turn)]
+
+
+def inverse(a: np.ndarray) -> np.ndarray:
+    back = conjugate(a[3:])
+    return np.r_[-rotate(back, a[:3]), back]
+
+
+def about(axis: int, angle: float) -> np.ndarray:
+    turn = np.zeros(4)
+    turn[axis], turn[3] = np.sin(0.5 * angle), np.cos(0.5 * angle)
+    return turn
+
+
+def kinds(joint: Joint) -> list[DofKind]:
+    """Of the joint's velocities."""
+    if joint.type is JointType.SPHERICAL:
+        return [DofKind.BALL, DofKind.BALL_ON, DofKind.BALL_ON]
+    return [DofKind.LINEAR if axis[0] == "t" else DofKind.ANGULAR for axis in joint.axes]
+
+
+def coordinates(joint: Joint, pose: np.ndarray) -> np.ndarray:
+    """q nearest to a pose of the frame on the child in that on the parent."""
+    q = [pose["xyz".index(axis[1])] for axis in joint.axes if axis[0] == "t"]
+    turn = pose[3:] if pose[6] >= 0.0 else -pose[3:]
+    if joint.type is JointType.SPHERICAL:
+        return np.r_[q, turn]
+    return np.r_[q, _angles(["xyz".index(axis[1]) for axis in joint.axes if axis[0] == "r"], turn)]
+
+
+def _angles(axes: list[int], turn: np.ndarray) -> np.ndarray:
+    """Angles about one, two or three axes in ascending order, each as turned by those before it, nearest to a rotation."""
+    if not axes:
+        return np.zeros(0)
+    if len(axes) == 1:
+        return np.array([2.0 * np.arctan2(turn[axes[0]], turn[3])])
+    matrix = np.array([rotate(turn, e) for e in np.eye(3)]).T
+    if len(axes) == 3:  # R_x R_y R_z
+        return np.array(
+            [np.arctan2(-matrix[1, 2], matrix[2, 2]), np.arcsin(np.clip(matrix[0, 2], -1.0, 1.0)), np.arctan2(-matrix[0, 1], matrix[0, 0])]
+        )
+    # R_a R_b = R: the second axis is where R_a has carried it, R e_b = R_a e_b; the first is fixed in the child but for R_b.
+    a, b = axes
+    c = 3 - a - b
+    sign = 1.0 if (b - a) % 3 == 1 else -1.0  # e_a x e_b = sign e_c
+    first = np.arctan2(sign * matrix[c, b], matrix[b, b])
+    rest = multiply(about(a, -first), turn)
+    return np.array([first, 2.0 * np.arctan2(rest[b], rest[3])])
+
+
+def pose_of(joint: Joint, q: np.ndarray) -> np.ndarray:
+    """Pose of the frame on the child in that on the parent."""
+    pose = np.r_[np.zeros(6), 1.0]
+    ways = [axis for axis in joint.axes if axis[0] == "t"]
+    for axis, value in zip(ways, q, strict=False):
+        pose["xyz".index(axis[1])] = value
+    rest = q[len(ways) :]
+    if joint.type is JointType.SPHERICAL:
+        pose[3:] = rest / np.linalg.norm(rest)
+    else:
+        for axis, value in zip([axis for axis in joint.axes if axis[0] == "r"], rest, strict=True):
+            pose[3:] = multiply(pose[3:], about("xyz".index(axis[1]), value))
+    return pose
+
+
+def columns(joint: Joint, frame: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """[6, n] twist of the child relative to the parent (velocity at the world's origin, angular) by each coordinate's velocity."""
+    x, turn, result = frame[:3].copy(), frame[3:], []
+    spherical = joint.type is JointType.SPHERICAL
+    if spherical:
+        turn = multiply(turn, q / np.linalg.norm(q))
+    for axis, value in zip(joint.axes, q, strict=False):
+        k = "xyz".index(axis[1])
+        direction = rotate(turn, np.eye(3)[k])
+        if axis[0] == "t":
+            x += value * direction
+            result.append(np.r_[direction, np.zeros(3)])
+        else:
+            result.append(np.r_[np.cross(x, direction), direction])
+            if not spherical:
+                turn = multiply(turn, about(k, value))
+    return np.array(result).reshape(-1, 6).T
+
+
+def forest(names: list[str], types: list[JointType], joints: list[Joint]) -> tuple[list[Joint | None], list[int], list[Joint]]:
+    """Joint that carries each body (None: free, kinematic or fixed), bodies with parents first, joints that close loops.
+
+    Bodies that are joined to the world, or to a body that forces do not move, hang there; of others the first one is free and carries
+    the rest. Breadth first, so that loops are cut far from the root.
+    """
+    neighbours: dict[int, list[tuple[Joint, int]]] = {b: [] for b in range(-1, len(names))}
+    for joint in (joint for joint in joints if not joint.loop):
+        neighbours[joint.parent].append((joint, joint.child))
+        neighbours[joint.child].append((joint, joint.parent))
+    carried: dict[int, Joint | None] = {-1: None}
+    used: set[int] = set()
+
+    def spread(roots: list[int]) -> None:
+        queue = list(roots)
+        while queue:
+            b = queue.pop(0)
+            for joint, other in neighbours[b]:
+                if other not in carried:
+                    carried[other] = joint if joint.child == other else turned(joint)
+                    used.add(id(joint))
+                    queue.append(other)
+
+    still = [b for b, kind in enumerate(types) if kind is not JointType.FREE]
+    for b in still:
+        carried[b] = None
+    spread([-1, *still])
+    for b in range(len(names)):
+        if b not in carried:
+            carried[b] = None
+            spread([b])
+    above = [carried[b] for b in range(len(names))]
+    order = parents_first([-1 if joint is None else joint.parent for joint in above])
+    return above, order, [joint for joint in joints if id(joint) not in used]
+
+
+def loop_of(joint: Joint) -> Loop:
+    """The same joint as a constraint."""
+    x, y, z, rx, ry, rz = (axis not in joint.axes for axis in AXES)
+    frames = np.array([joint.parent_frame, joint.child_frame])
+    return Loop(joint.name, (joint.parent, joint.child), frames, (x, y, z), (rx, ry, rz), joint.distance)
+
+
+def turned(joint: Joint) -> Joint:
+    """The same joint followed from its child to its parent; its coordinate keeps its sign (a ball's turns the other way)."""
+    if len(joint.axes) > 1 and joint.type is not JointType.SPHERICAL:
+        raise ModelError(
+            f"{joint.name}: the first body of this {joint.type.name} joint would hang on its second; exchange them, or fix the first"
+        )
+    half = np.array([0.0, 0.0, 0.0, 1.0])
+    if len(joint.axes) == 1:  # about another axis by a half turn: the free axis then points the other way
+        half = about(("xyz".index(joint.axes[0][1]) + 1) % 3, np.pi)
+    half = np.r_[np.zeros(3), half]
+    return replace(
+        joint,
+        parent=joint.child,
+        child=joint.parent,
+        parent_frame=compose(joint.child_frame, half),
+        child_frame=compose(joint.parent_frame, half),
+    )
