@@ -532,6 +532,17 @@ def test_arm_presses_on_the_ground():
     assert not sim.status.numpy().any()
 
 
+def test_a_loop_between_what_forces_do_not_move_is_nothing():
+    """A belt hinged to the world moves on as it does."""
+    builder = slider()
+    belt = builder.add_body(joint=JointType.KINEMATIC, velocity=(1.0, 0, 0))
+    builder.add_joint(JointType.REVOLUTE, -1, belt, loop=True)
+    sim = simulator(builder, dt=1e-2)
+    sim.step(100)
+    assert sim.body_pose.numpy()[0, 1, 0] == pytest.approx(1.0)
+    assert not sim.status.numpy().any()
+
+
 # ------------------------------------------------------------------------------------------------------------ bad input
 
 

@@ -133,6 +133,13 @@ def test_attributes_of_other_engines():
     assert model.joint_friction[6] == pytest.approx(2.0)
 
 
+def test_attributes_of_other_engines_that_are_not_read_are_named():
+    """On joints too: a limit on the velocity, and stiffness of a limit."""
+    content = "float physxJoint:maxJointVelocity = 100; float physxLimit:angular:stiffness = 5; float newton:armature = 0.01;"
+    ignored = read(*pair("Revolute", content)).report.ignored
+    assert [(i.path, i.what) for i in ignored] == [("/J", "physxJoint:maxJointVelocity"), ("/J", "physxLimit:angular:stiffness")]
+
+
 @needs_shared
 @pytest.mark.parametrize(
     ("file", "bodies", "nv", "mass"),

@@ -123,6 +123,8 @@ def rows(model: Model) -> list[Row]:
         if np.isfinite(high):
             table.append(Row(int(tree.LIMIT_HIGH), i, owner, limit=high))
     for loop in model.loops:
+        if not model.movable[list(loop.bodies)].any():
+            continue  # nothing that forces move
         base = Row(int(tree.LOOP_WAY), bodies=loop.bodies, frames=loop.frames)
         if loop.distance is not None:
             if loop.distance[0] > 0.0:

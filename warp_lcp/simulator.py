@@ -236,8 +236,7 @@ class Simulator:
         inputs += [self.residual, self.residual_energy, self.iterations, self.status]
         wp.launch(self._kernels.reset, dim=self.num_envs, inputs=inputs, device=self.device)
         if self.model.articulated:
-            drive = [self._constant(self.model.drive[:, k], self.real) for k in (3, 4)]
-            wp.launch(self._kernels.reset_control, dim=self.num_envs, inputs=[mask, *drive, self.mechanics], device=self.device)
+            wp.launch(self._kernels.reset_control, dim=self.num_envs, inputs=[mask, *self._targets, self.mechanics], device=self.device)
 
     # ------------------------------------------------------------------------------------------- parameters and views
 
@@ -528,6 +527,7 @@ class Simulator:
         if m.articulated:
             trees = self.mechanics = articulation.arrays(self, tree.functions(self.real).Trees)
             self.control = Control(trees.target, trees.target_rate, trees.force)
+            self._targets = [self._constant(m.drive[:, k], self.real) for k in (3, 4)]
 
         slots = self.slots = t.Slots()
         slots.point, slots.normal = self._array(c, t.vec3), self._array(c, t.vec3)

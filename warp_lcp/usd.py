@@ -62,6 +62,9 @@ VENDOR_ATTRIBUTES: dict[str, dict[str, Any] | None] = {
     "physxForce": None,
     "physxSurfaceVelocity": None,
     "physxTendon": None,
+    "physxLimit": None,
+    "physxJoint": {"maxJointVelocity": 0.0},
+    "physxArticulation": {"enabledSelfCollisions": True},
     "physxParticle": None,
     "physxDeformable": None,
     "physxMaterial": {"frictionCombineMode": "average", "compliantContactStiffness": 0.0, "compliantContactDamping": 0.0},
@@ -73,6 +76,12 @@ VENDOR_ATTRIBUTES: dict[str, dict[str, Any] | None] = {
         "torsionalFriction": 0.0,
         "contactMargin": 0.0,
         "massModel": "solid",
+        "velocityLimit": 0.0,
+        "effortLimit": 0.0,
+        "limitStiffness": 0.0,
+        "limitDamping": 0.0,
+        "selfCollisionEnabled": True,
+        "jointsAddMobility": False,
     },
     "mjc": {"solref": None, "solimp": None, "condim": 3, "priority": 0, "solmix": 1.0, "gravcomp": 0.0, "margin": 0.0, "inertia": ""},
 }
@@ -757,7 +766,7 @@ class _Reader:
                 skip = path
                 self._instancer(prim)
             elif path in self.all_joints:
-                continue
+                self._attributes(prim)
             elif type_name.endswith("Joint"):
                 self._repeat(path, type_name, "not a joint type of UsdPhysics: what it connects is not connected")
             elif type_name.startswith(("Mjc", "Newton", "Physx")) and not type_name.endswith("Scene"):
