@@ -38,54 +38,8 @@ import numpy as np
 from .builder import ModelBuilder, capsule_solid, rotation_matrix
 from .errors import MissingExtra, ModelError, SceneError
 from .model import Ignored, JointType, Material, Model, Report
+from .usd_attributes import CONTACT_ATTRIBUTES, SURFACE_VELOCITY, unread
 from .usd_joints import JointReader
-
-CONTACT_ATTRIBUTES = {
-    "warpLcp:normalStiffness": "normal_stiffness",
-    "warpLcp:normalDamping": "normal_damping",
-    "warpLcp:tangentStiffness": "tangent_stiffness",
-    "warpLcp:tangentDamping": "tangent_damping",
-    "warpLcp:slipThreshold": "slip_threshold",
-}
-SURFACE_VELOCITY = "warpLcp:surfaceVelocity"
-
-#: Attributes of other engines that change the motion: family -> names (None: all), with the value that has no effect.
-VENDOR_ATTRIBUTES: dict[str, dict[str, Any] | None] = {
-    "physxRigidBody": {
-        "disableGravity": False,
-        "linearDamping": 0.0,
-        "angularDamping": 0.0,
-        "lockedPosAxis": 0,
-        "lockedRotAxis": 0,
-        "enableGyroscopicForces": True,
-    },
-    "physxForce": None,
-    "physxSurfaceVelocity": None,
-    "physxTendon": None,
-    "physxLimit": None,
-    "physxJoint": {"maxJointVelocity": 0.0},
-    "physxArticulation": {"enabledSelfCollisions": True},
-    "physxParticle": None,
-    "physxDeformable": None,
-    "physxMaterial": {"frictionCombineMode": "average", "compliantContactStiffness": 0.0, "compliantContactDamping": 0.0},
-    "physxCollision": {"restOffset": 0.0},
-    "newton": {
-        "contactStiffness": 0.0,
-        "contactDamping": 0.0,
-        "rollingFriction": 0.0,
-        "torsionalFriction": 0.0,
-        "contactMargin": 0.0,
-        "massModel": "solid",
-        "velocityLimit": 0.0,
-        "effortLimit": 0.0,
-        "limitStiffness": 0.0,
-        "limitDamping": 0.0,
-        "selfCollisionEnabled": True,
-        "jointsAddMobility": False,
-    },
-    "mjc": {"solref": None, "solimp": None, "condim": 3, "priority": 0, "solmix": 1.0, "gravcomp": 0.0, "margin": 0.0, "inertia": ""},
-}
-VENDOR_NAMES = {"physx": "PhysX", "newton": "Newton", "mjc": "MuJoCo"}
 
 _UNIFORM = 1e-4  # relative: scales closer than this are equal, axes closer than this are perpendicular
 _LISTED = 100  # unsupported prims that an error lists by path; the report always has all
@@ -766,14 +720,16 @@ class _Reader:
                 skip = path
                 self._instancer(prim)
             elif path in self.all_joints:
-                self._attributes(prim)
+                for what, why in unread(prim, self.read_attributes):
+                    self._repeat(path, what, why)
             elif type_name.endswith("Joint"):
                 self._repeat(path, type_name, "not a joint type of UsdPhysics: what it connects is not connected")
             elif type_name.startswith(("Mjc", "Newton", "Physx")) and not type_name.endswith("Scene"):
                 self._repeat(path, type_name, "warp_lcp reads plain UsdPhysics")
             else:
                 self._collider_type(prim, path, type_name)
-                self._attributes(prim)
+                for what, why in unread(prim, self.read_attributes):
+                    self._repeat(path, what, why)
 
     def _instancer(self, prim: Any) -> None:
         targets = [self.stage.GetPrimAtPath(p) for p in self.px.UsdGeom.PointInstancer(prim).GetPrototypesRel().GetTargets()]
@@ -798,61 +754,6 @@ class _Reader:
         else:
             what = f"PhysicsCollisionAPI on {type_name or 'an untyped prim'}"
             self._repeat(path, what, "it is no geometry: apply it to the shapes below")
-
-    def _attributes(self, prim: Any) -> None:
-        """Authored attributes that would change the motion and are not read: one entry for each family."""
-        families: dict[str, list[str]] = {}
-        defined: set[str] | None = None
-        for attribute in prim.GetAuthoredAttributes():
-            name = attribute.GetName()
-            family = name.partition(":")[0]
-            if family == "warpLcp" and attribute.GetPath() not in self.read_attributes:
-                self._stray(prim, name)
-            elif family == "physics":
-                defined = set(prim.GetPrimDefinition().GetPropertyNames()) if defined is None else defined
-                stray = name.count(":") == 1 and name not in defined and not isinstance(attribute.Get(), str)
-                if stray and not _neutral(attribute.Get()):
-                    families.setdefault("physics", []).append(name)
-            elif _changes_motion(name, attribute):
-                families.setdefault(family, []).append(name)
-        for family, names in families.items():
-            if family == "physics":
-                why = "no schema applied to this prim has it, so USD does not read it; apply PhysicsMassAPI, PhysicsRigidBodyAPI, ..."
-            else:
-                engine = next((v for k, v in VENDOR_NAMES.items() if family.startswith(k)), family)
-                why = f"an extension of {engine}; warp_lcp reads plain UsdPhysics"
-            self._repeat(prim.GetPath(), ", ".join(sorted(names)), why)
-
-    def _stray(self, prim: Any, name: str) -> None:
-        known = [*CONTACT_ATTRIBUTES, SURFACE_VELOCITY]
-        if name in known:
-            where = "an enabled collider" if name == SURFACE_VELOCITY else "a PhysicsMaterialAPI prim bound to a collider"
-            self._repeat(prim.GetPath(), name, f"has an effect only on {where}")
-            return
-        near = difflib.get_close_matches(name, known, n=1)
-        self._repeat(prim.GetPath(), name, f"unknown attribute{f'; did you mean {near[0]}?' if near else ''}")
-
-
-def _changes_motion(name: str, attribute: Any) -> bool:
-    family, _, rest = name.partition(":")
-    names = VENDOR_ATTRIBUTES.get(family, {})
-    if names is None:
-        return not _neutral(attribute.Get())
-    if rest not in names:
-        return False
-    value, default = attribute.Get(), names[rest]
-    return value != default and (default is True or not _neutral(value))
-
-
-def _neutral(value: Any) -> bool:
-    """Zero, false, empty or infinite: the ways in which schemas say 'nothing'."""
-    if value is None or isinstance(value, str):
-        return not value
-    try:
-        numbers = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        return False
-    return not np.any(np.isfinite(numbers) & (numbers != 0.0))
 
 
 def _written(value: float) -> float:
