@@ -32,10 +32,11 @@ def axes(real) -> SimpleNamespace:
         return result
 
     @wp.func
-    def touching_depth(gravity: vec3, inverse_a: real, inverse_b: real, stiffness: real, smallest: real) -> real:
-        """How deep shapes may overlap that count as touching; smallest: of their half extents."""
+    def touching_depth(gravity: vec3, inverse_a: real, inverse_b: real, stiffness: real) -> vec3:
+        """How deep shapes may overlap that count as touching: what their load presses them in, m, no less than the first and no more
+        than the last of these parts of the smallest half extent."""
         load = wp.length(gravity) / wp.max(wp.max(inverse_a, inverse_b), real(1.0e-30))
-        return wp.clamp(real(ELASTIC_RANGE) * load / stiffness, real(TOUCHING) * smallest, real(SUNK) * smallest)
+        return vec3(real(TOUCHING), real(ELASTIC_RANGE) * load / stiffness, real(SUNK))
 
     @wp.func
     def face_separation(d: vec3, rotation: mat33, ha: vec3, hb: vec3, axis: int) -> real:
@@ -395,7 +396,8 @@ def make(real):
                 inverse_b = inverse_mass(topology, bodies, env, sb)
                 gravity = parameters.gravity[env % parameters.gravity.shape[0]]
                 stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
-                touching = touching_depth(gravity, inverse_a, inverse_b, stiffness, smallest)
+                depth = touching_depth(gravity, inverse_a, inverse_b, stiffness)
+                touching = wp.clamp(depth[1], depth[0] * smallest, depth[2] * smallest)
                 far = real(2.0) * apart
                 best = real(-2.0) * far
                 axis = int(0)

@@ -20,7 +20,7 @@ import warp as wp
 
 from .box_box import axes
 from .collide import NO_POINT, pair_functions
-from .shapes import CONE, CYLINDER, ROUND, functions
+from .shapes import CONE, ROUND, functions
 from .types import OPTIONS, scalar_types
 
 # Points of a pair of sharp shapes; corners of one cap on a plane; room for the corners of a face while it is clipped.
@@ -29,6 +29,8 @@ RING = 6
 CLIPPED = 32
 # Sine of the angle between lines that lie side by side.
 BESIDE = wp.constant(1.0e-3)
+# Of the size: a corner this close to the side of a face is on it.
+SLACK = wp.constant(1.0e-5)
 
 
 @functools.cache
@@ -111,25 +113,22 @@ def clipping(real) -> SimpleNamespace:
 
 
 @functools.cache
-def make(real) -> SimpleNamespace:
-    """Kernels ``sharp`` (cylinders, cones, hulls and boxes with each other) and ``on_plane``; launch with dim (E, pairs of a kind)."""
+def meeting(real):
+    """Function ``meet``: where two sharp shapes touch or could."""
     t = scalar_types(real)
-    vec3, mat33 = t.vec3, t.mat33
-    Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
-    f, a, s, c = pair_functions(real), axes(real), functions(real), clipping(real)
-    shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
-    far_apart, set_apart, rank = f.far_apart, f.set_apart, a.rank
-    inverse_mass, touching_depth = a.inverse_mass, a.touching_depth
-    Hulls, support, part, face_towards, face_normal = s.Hulls, s.support, s.part, s.face_towards, s.face_normal
-    ring_point, turned_to, sides, side_plane = s.ring_point, s.turned_to, s.sides, s.side_plane
-    clip, spread = c.clip, c.spread
+    vec3, mat33, transform = t.vec3, t.mat33, t.transform
+    a, s, c = axes(real), functions(real), clipping(real)
+    rank, Hulls, support, part, face_towards, face_normal = a.rank, s.Hulls, s.support, s.part, s.face_towards, s.face_normal
+    turned, turned_to, sides, side_plane, clip, spread = s.turned, s.turned_to, s.sides, s.side_plane, c.clip, c.spread
 
     @wp.func
     def smallest_size(hulls: Hulls, shape: int, size: vec3) -> real:
-        kind = hulls.kind[shape]
+        """Half extent; what is flat has none."""
         least = wp.min(size[0], size[1])
-        if kind != CYLINDER and kind != CONE:
+        if not turned(hulls.kind[shape]):
             least = wp.min(least, size[2])
+        if least <= real(0.0):
+            least = real(1.0e30)
         return least
 
     @wp.func
@@ -138,10 +137,167 @@ def make(real) -> SimpleNamespace:
         p = support(hulls, a, size_a, n)
         return wp.dot(n, d + turn * support(hulls, b, size_b, wp.transpose(turn) * (-n)) - p)
 
+    @wp.func
+    def meet(
+        hulls: Hulls,
+        a: int,
+        b: int,
+        size_a: vec3,
+        size_b: vec3,
+        xa: transform,
+        xb: transform,
+        motion: vec3,
+        deep: vec3,
+        share: real,
+        normal: wp.array(dtype=vec3),
+        at: wp.array(dtype=vec3),
+        gaps: wp.array(dtype=real),
+        features: wp.array(dtype=int),
+    ) -> int:
+        """Fills normal[0] from a to b, and points, gaps and features of up to POINTS contacts, world axes; returns their number.
+
+        xa, xb: poses. motion: of b relative to a over the step, world axes. deep: least depth, load over stiffness and most, the first
+        and last as parts of the smallest half extent: what overlaps by less counts as touching. share: how near to b's the
+        point is while they are apart and come from the side, 0 to 1.
+        """
+        axes_a = wp.quat_to_matrix(wp.transform_get_rotation(xa))
+        turn = wp.transpose(axes_a) * wp.quat_to_matrix(wp.transform_get_rotation(xb))
+        d = wp.transpose(axes_a) * (wp.transform_get_translation(xb) - wp.transform_get_translation(xa))
+        move = wp.transpose(axes_a) * motion
+        scale = wp.length(size_a) + wp.length(size_b)
+        smallest = wp.min(smallest_size(hulls, a, size_a), smallest_size(hulls, b, size_b))
+        touching = wp.clamp(deep[1], deep[0] * smallest, deep[2] * smallest)
+        # As of two boxes: axes are compared where the shapes would be after the step, but first those that part them now.
+        best = part(hulls, a, b, size_a, size_b, d, turn, move, scale)
+        if best.separation < -touching:
+            best = part(hulls, a, b, size_a, size_b, d, turn, vec3(), scale)
+        n = best.normal
+        far = real(4.0) * (scale + wp.length(move))
+        ranked = rank(best.separation, best.separation + wp.dot(n, move), touching, far) - real(1.0e-3) * smallest
+        # Faces are preferred to edges, and those of a, so that equal separations do not flip from step to step.
+        face = face_towards(hulls, a, n)
+        n_a = face_normal(hulls, a, face)
+        now = separation(hulls, a, b, size_a, size_b, d, turn, n_a)
+        owner = int(0)
+        if rank(now, now + wp.dot(n_a, move), touching, far) >= ranked:
+            owner = 1
+        else:
+            face = face_towards(hulls, b, wp.transpose(turn) * (-n))
+            n_b = turn * face_normal(hulls, b, face)
+            now = separation(hulls, a, b, size_a, size_b, d, turn, -n_b)
+            if rank(now, now - wp.dot(n_b, move), touching, far) >= ranked:
+                owner = 2
+
+        points = wp.zeros(shape=(CLIPPED,), dtype=vec3)
+        edges = wp.zeros(shape=(CLIPPED,), dtype=int)
+        spare = wp.zeros(shape=(CLIPPED,), dtype=vec3)
+        spare_edges = wp.zeros(shape=(CLIPPED,), dtype=int)
+        count = int(0)
+        if owner > 0:
+            # In the frame of the face's owner; the other shape is where they meet, if it comes from the side.
+            one = a
+            other = b
+            size_one = size_a
+            size_other = size_b
+            pose = xa
+            to = d
+            other_turn = turn
+            way = move
+            part_way = share
+            if owner == 2:
+                one = b
+                other = a
+                size_one = size_b
+                size_other = size_a
+                pose = xb
+                other_turn = wp.transpose(turn)
+                to = -(other_turn * d)
+                way = -(other_turn * move)
+                part_way = real(1.0) - share
+            out = face_normal(hulls, one, face)
+            along = vec3()
+            closing = -wp.dot(out, way)
+            if now > real(0.0) and closing > now:
+                along = way * (now / closing)
+                along -= out * wp.dot(out, along)
+            number = turned_to(hulls, other, size_other, wp.transpose(other_turn) * (-out), points)
+            count = number
+            for k in range(count):
+                points[k] = to + along + other_turn * points[k]
+                edges[k] = k
+            for k in range(sides(hulls, one, face)):
+                plane = side_plane(hulls, one, size_one, face, k)
+                m = vec3(plane[0], plane[1], plane[2])
+                if count > 0:
+                    count = clip(points, edges, spare, spare_edges, count, m, plane[3], real(SLACK) * scale, ROUND + k)
+            count = spread(points, edges, count, out)
+            level = wp.dot(out, support(hulls, one, size_one, out))
+            normal[0] = wp.transform_vector(pose, out)
+            if owner == 2:
+                normal[0] = -normal[0]
+            for k in range(count):
+                gap = wp.dot(out, points[k]) - level
+                before = edges[(k + count - 1) % count]
+                at[k] = wp.transform_point(pose, points[k] - real(0.5) * gap * out - part_way * along)
+                gaps[k] = gap
+                features[k] = (((owner * 4099 + face) * 67 + before) * 67 + edges[k]) & 0x3FFFFFFF
+        if count == 0:
+            # Edges cross, lines lie side by side, or nothing is over the face: one that is only as good as the best axis is not it.
+            normal[0] = wp.transform_vector(xa, n)
+            line_a = int(0)
+            line_b = int(0)
+            if turned(hulls.kind[a]):
+                line_a = turned_to(hulls, a, size_a, n, points)
+            if turned(hulls.kind[b]):
+                line_b = turned_to(hulls, b, size_b, wp.transpose(turn) * (-n), spare)
+            if line_a == 2 and line_b == 2:
+                # Two lines side by side rest on both ends of what they share.
+                e = points[1] - points[0]
+                length = wp.length(e)
+                e = e / length
+                p = d + turn * spare[0] - points[0]
+                q = d + turn * spare[1] - points[0]
+                low = wp.max(wp.min(wp.dot(p, e), wp.dot(q, e)), real(0.0))
+                high = wp.min(wp.max(wp.dot(p, e), wp.dot(q, e)), length)
+                if wp.length(wp.cross(e, q - p)) < real(BESIDE) * wp.length(q - p) and high > low:
+                    for k in range(2):
+                        x = low
+                        if k == 1:
+                            x = high
+                        on_b = p + (q - p) * ((x - wp.dot(p, e)) / wp.dot(q - p, e))
+                        gaps[k] = wp.dot(n, on_b - x * e)
+                        at[k] = wp.transform_point(xa, points[0] + x * e + real(0.5) * gaps[k] * n)
+                        features[k] = k
+                    count = 2
+            if count == 0:
+                at[0] = wp.transform_point(xa, best.point + real(0.5) * best.separation * n)
+                gaps[0] = best.separation
+                features[0] = 0
+                count = 1
+        return count
+
+    return meet
+
+
+@functools.cache
+def make(real) -> SimpleNamespace:
+    """Kernels ``sharp`` (cylinders, cones, hulls and boxes with each other) and ``on_plane``; launch with dim (E, pairs of a kind)."""
+    t = scalar_types(real)
+    vec3 = t.vec3
+    Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
+    f, a, s, meet = pair_functions(real), axes(real), functions(real), meeting(real)
+    shape_pose, reach, shape_velocity, write, far_apart, set_apart = (
+        f.shape_pose,
+        f.reach,
+        f.shape_velocity,
+        f.write,
+        f.far_apart,
+        f.set_apart,
+    )
+    inverse_mass, touching_depth, Hulls, ring_point, turned = a.inverse_mass, a.touching_depth, s.Hulls, s.ring_point, s.turned
+
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def sharp(
-        topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int
-    ):
+    def sharp(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int):
         start, index = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + index
@@ -150,142 +306,46 @@ def make(real) -> SimpleNamespace:
             if far_apart(bodies, env, sa, sb):
                 set_apart(topology, slots, env, pair)
                 continue
-            size_a = topology.shape_size[sa]
-            size_b = topology.shape_size[sb]
             xa = shape_pose(topology, bodies, env, sa)
             xb = shape_pose(topology, bodies, env, sb)
-            ca = wp.transform_get_translation(xa)
-            cb = wp.transform_get_translation(xb)
-            axes_a = wp.quat_to_matrix(wp.transform_get_rotation(xa))
-            turn = wp.transpose(axes_a) * wp.quat_to_matrix(wp.transform_get_rotation(xb))
-            d = wp.transpose(axes_a) * (cb - ca)
-            u = shape_velocity(topology, bodies, bodies.velocity, env, sb, cb)
-            u -= shape_velocity(topology, bodies, bodies.velocity, env, sa, ca)
-            move = h * (wp.transpose(axes_a) * u)
-            scale = wp.length(size_a) + wp.length(size_b)
-            smallest = wp.min(smallest_size(hulls, sa, size_a), smallest_size(hulls, sb, size_b))
+            u = shape_velocity(topology, bodies, bodies.velocity, env, sb, wp.transform_get_translation(xb))
+            u -= shape_velocity(topology, bodies, bodies.velocity, env, sa, wp.transform_get_translation(xa))
             inverse_a = inverse_mass(topology, bodies, env, sa)
             inverse_b = inverse_mass(topology, bodies, env, sb)
             gravity = parameters.gravity[env % parameters.gravity.shape[0]]
             stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
-            touching = touching_depth(gravity, inverse_a, inverse_b, stiffness, smallest)
-            # As of two boxes: axes are compared where the shapes would be after the step, but first those that part them now.
-            best = part(hulls, sa, sb, size_a, size_b, d, turn, move, scale)
-            if best.separation < -touching:
-                best = part(hulls, sa, sb, size_a, size_b, d, turn, vec3(), scale)
-            n = best.normal
-            far = real(4.0) * (scale + wp.length(move))
-            ranked = rank(best.separation, best.separation + wp.dot(n, move), touching, far) - real(1.0e-3) * smallest
-            # Faces are preferred to edges, and those of a, so that equal separations do not flip from step to step.
-            face = face_towards(hulls, sa, n)
-            n_a = face_normal(hulls, sa, face)
-            now = separation(hulls, sa, sb, size_a, size_b, d, turn, n_a)
-            owner = int(0)
-            if rank(now, now + wp.dot(n_a, move), touching, far) >= ranked:
-                owner = 1
-            else:
-                face = face_towards(hulls, sb, wp.transpose(turn) * (-n))
-                n_b = turn * face_normal(hulls, sb, face)
-                now = separation(hulls, sa, sb, size_a, size_b, d, turn, -n_b)
-                if rank(now, now - wp.dot(n_b, move), touching, far) >= ranked:
-                    owner = 2
             # Levers are those of the lighter shape, which turns more easily.
             share = real(0.5)
             if inverse_a + inverse_b > real(0.0):
                 share = inverse_b / (inverse_a + inverse_b)
-
-            points = wp.zeros(shape=(CLIPPED,), dtype=vec3)
-            edges = wp.zeros(shape=(CLIPPED,), dtype=int)
-            spare = wp.zeros(shape=(CLIPPED,), dtype=vec3)
-            spare_edges = wp.zeros(shape=(CLIPPED,), dtype=int)
+            normal = wp.zeros(shape=(1,), dtype=vec3)
+            at = wp.zeros(shape=(POINTS,), dtype=vec3)
+            gaps = wp.zeros(shape=(POINTS,), dtype=real)
+            features = wp.zeros(shape=(POINTS,), dtype=int)
+            count = meet(
+                hulls,
+                sa,
+                sb,
+                topology.shape_size[sa],
+                topology.shape_size[sb],
+                xa,
+                xb,
+                h * u,
+                touching_depth(gravity, inverse_a, inverse_b, stiffness),
+                share,
+                normal,
+                at,
+                gaps,
+                features,
+            )
             slot = topology.pair_slots[pair]
-            count = int(0)
-            if owner > 0:
-                # In the frame of the face's owner; the other shape is where they meet, if it comes from the side.
-                one = sa
-                other = sb
-                size_one = size_a
-                size_other = size_b
-                pose = xa
-                to = d
-                other_turn = turn
-                way = move
-                if owner == 2:
-                    one = sb
-                    other = sa
-                    size_one = size_b
-                    size_other = size_a
-                    pose = xb
-                    other_turn = wp.transpose(turn)
-                    to = -(other_turn * d)
-                    way = -(other_turn * move)
-                    share = real(1.0) - share
-                out = face_normal(hulls, one, face)
-                along = vec3()
-                closing = -wp.dot(out, way)
-                if now > real(0.0) and closing > now:
-                    along = way * (now / closing)
-                    along -= out * wp.dot(out, along)
-                number = turned_to(hulls, other, size_other, wp.transpose(other_turn) * (-out), points)
-                count = number
-                for k in range(count):
-                    points[k] = to + along + other_turn * points[k]
-                    edges[k] = k
-                for k in range(sides(hulls, one, face)):
-                    plane = side_plane(hulls, one, size_one, face, k)
-                    m = vec3(plane[0], plane[1], plane[2])
-                    if count > 0:
-                        count = clip(points, edges, spare, spare_edges, count, m, plane[3], real(1.0e-4) * plane[3], ROUND + k)
-                count = spread(points, edges, count, out)
-                level = wp.dot(out, support(hulls, one, size_one, out))
-                outward = wp.transform_vector(pose, out)
-                if owner == 2:
-                    outward = -outward
-                for k in range(count):
-                    gap = wp.dot(out, points[k]) - level
-                    at = points[k] - real(0.5) * gap * out - share * along
-                    before = edges[(k + count - 1) % count]
-                    feature = (((owner * 4099 + face) * 67 + before) * 67 + edges[k]) & 0x3FFFFFFF
-                    write(slots, env, slot + k, wp.transform_point(pose, at), outward, gap, feature)
-            if count == 0:
-                # Edges cross, lines lie side by side, or nothing is over the face: one that is only as good as the best axis is not it.
-                outward = wp.transform_vector(xa, n)
-                line_a = int(0)
-                line_b = int(0)
-                if hulls.kind[sa] == CYLINDER or hulls.kind[sa] == CONE:
-                    line_a = turned_to(hulls, sa, size_a, n, points)
-                if hulls.kind[sb] == CYLINDER or hulls.kind[sb] == CONE:
-                    line_b = turned_to(hulls, sb, size_b, wp.transpose(turn) * (-n), spare)
-                if line_a == 2 and line_b == 2:
-                    # Two lines side by side rest on both ends of what they share.
-                    e = points[1] - points[0]
-                    length = wp.length(e)
-                    e = e / length
-                    p = d + turn * spare[0] - points[0]
-                    q = d + turn * spare[1] - points[0]
-                    low = wp.max(wp.min(wp.dot(p, e), wp.dot(q, e)), real(0.0))
-                    high = wp.min(wp.max(wp.dot(p, e), wp.dot(q, e)), length)
-                    if wp.length(wp.cross(e, q - p)) < real(BESIDE) * wp.length(q - p) and high > low:
-                        for k in range(2):
-                            x = low
-                            if k == 1:
-                                x = high
-                            on_b = p + (q - p) * ((x - wp.dot(p, e)) / wp.dot(q - p, e))
-                            gap = wp.dot(n, on_b - x * e)
-                            at = points[0] + x * e + real(0.5) * gap * n
-                            write(slots, env, slot + k, wp.transform_point(xa, at), outward, gap, k)
-                        count = 2
-                if count == 0:
-                    at = best.point + real(0.5) * best.separation * n
-                    write(slots, env, slot, wp.transform_point(xa, at), outward, best.separation, 0)
-                    count = 1
+            for k in range(count):
+                write(slots, env, slot + k, at[k], normal[0], gaps[k], features[k])
             for k in range(count, POINTS):
                 slots.gap[env, slot + k] = real(NO_POINT)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def on_plane(
-        topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int
-    ):
+    def on_plane(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int):
         start, index = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + index
@@ -307,7 +367,7 @@ def make(real) -> SimpleNamespace:
             number = topology.pair_slots[pair + 1] - slot
             for k in range(number):
                 p = vec3()
-                if kind == CYLINDER or kind == CONE:
+                if turned(kind):
                     z = -size[1]
                     if k >= RING:
                         z = size[1]

@@ -19,7 +19,7 @@ import warp as wp
 
 from .capsule import covered_within
 from .collide import NO_POINT, pair_functions
-from .shapes import CONE, CYLINDER, functions
+from .shapes import functions
 from .types import OPTIONS, scalar_types
 
 # Of the size: a core closer than this to the other shape has no direction of its own to it.
@@ -110,9 +110,8 @@ def distance(real) -> SimpleNamespace:
                 x = -half
             q = p - c - x * e
             going = rounds < ROUNDS
-            if count > 0:
-                if wp.dot(v, v) - wp.dot(v, q) <= real(wp.static(NEAREST[real])) * wp.dot(v, v):
-                    going = False
+            if count > 0 and wp.dot(v, v) - wp.dot(v, q) <= real(wp.static(NEAREST[real])) * wp.dot(v, v):
+                going = False
             for k in range(count):
                 if w[k] == q:
                     going = False
@@ -191,13 +190,11 @@ def make(real):
     shape_pose, reach, shape_velocity, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write_bent
     far_apart, set_apart, bend, shape_turn, rotation, shift = f.far_apart, f.set_apart, f.bend, f.shape_turn, f.rotation, f.shift
     Hulls, part, face_towards, face_normal = s.Hulls, s.part, s.face_towards, s.face_normal
-    sides, side_plane = s.sides, s.side_plane
+    sides, side_plane, turned = s.sides, s.side_plane, s.turned
     nearest = distance(real).nearest
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def rounded(
-        topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int
-    ):
+    def rounded(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int):
         start, index = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
             pair = first + index
@@ -285,7 +282,7 @@ def make(real):
                                 elif slope * half < real(-1.0e-6) * half and -over / slope > low and -over / slope < high:
                                     low = -over / slope
                                     low_end = 1 + m
-                        elif (kind == CYLINDER or kind == CONE) and wp.abs(e[2]) > real(OVER):
+                        elif turned(kind) and wp.abs(e[2]) > real(OVER):
                             one = (-size[1] - c[2]) / e[2]
                             two = (size[1] - c[2]) / e[2]
                             if one > two:

@@ -56,11 +56,16 @@ def functions(real) -> SimpleNamespace:
         point: vec3  # of a
 
     @wp.func
+    def turned(kind: int) -> bool:
+        """Is it round about its z axis, with a cap?"""
+        return kind == CYLINDER or kind == CONE
+
+    @wp.func
     def support(hulls: Hulls, shape: int, size: vec3, d: vec3) -> vec3:
         """Point furthest along d, in the frame of the shape; of balls and capsules without their radius."""
         kind = hulls.kind[shape]
         p = vec3()
-        if kind == CYLINDER or kind == CONE:
+        if turned(kind):
             across = wp.sqrt(d[0] * d[0] + d[1] * d[1])
             p[2] = -size[1]
             if across > real(0.0):
@@ -108,9 +113,7 @@ def functions(real) -> SimpleNamespace:
             offsets[face] = wp.dot(n, origin) / length
 
     @wp.func
-    def part(
-        hulls: Hulls, a: int, b: int, size_a: vec3, size_b: vec3, d: vec3, turn: mat33, move: vec3, scale: real
-    ) -> Axis:
+    def part(hulls: Hulls, a: int, b: int, size_a: vec3, size_b: vec3, d: vec3, turn: mat33, move: vec3, scale: real) -> Axis:
         """The axis along which a and b overlap least, or are furthest apart, once b has moved by `move`; all in the frame of a.
 
         It is the facet of their Minkowski difference A - B that is nearest to the origin, found by growing a polytope inside it from its
@@ -249,7 +252,7 @@ def functions(real) -> SimpleNamespace:
     def face_normal(hulls: Hulls, shape: int, face: int) -> vec3:
         kind = hulls.kind[shape]
         n = vec3(real(0.0), real(0.0), real(1.0))
-        if kind == CYLINDER or kind == CONE:
+        if turned(kind):
             if face == 1:
                 n = -n
         else:
@@ -278,7 +281,7 @@ def functions(real) -> SimpleNamespace:
         kind = hulls.kind[shape]
         count = int(0)
         across = wp.sqrt(d[0] * d[0] + d[1] * d[1])
-        if kind == CYLINDER or kind == CONE:
+        if turned(kind):
             side = wp.abs(d[2]) < across
             z = -size[1]
             if kind == CYLINDER:
@@ -316,7 +319,7 @@ def functions(real) -> SimpleNamespace:
         """How many sides a face has."""
         kind = hulls.kind[shape]
         count = int(ROUND)
-        if kind != CYLINDER and kind != CONE:
+        if not turned(kind):
             count = hulls.first_corner[face + 1] - hulls.first_corner[face]
         return count
 
@@ -326,7 +329,7 @@ def functions(real) -> SimpleNamespace:
         kind = hulls.kind[shape]
         m = vec3()
         c = real(0.0)
-        if kind == CYLINDER or kind == CONE:
+        if turned(kind):
             angle = real(wp.static(6.283185307179586)) * (real(k) + real(0.5)) / real(ROUND)
             m = vec3(wp.cos(angle), wp.sin(angle), real(0.0))
             c = size[0] * wp.cos(real(wp.static(3.141592653589793)) / real(ROUND))
@@ -342,6 +345,7 @@ def functions(real) -> SimpleNamespace:
     return SimpleNamespace(
         Hulls=Hulls,
         Axis=Axis,
+        turned=turned,
         support=support,
         part=part,
         face_towards=face_towards,
