@@ -20,7 +20,7 @@ import warp as wp
 
 from .box_box import axes
 from .collide import NO_POINT, pair_functions
-from .shapes import CONE, ROUND, functions
+from .shapes import CONE, PIECE, ROUND, functions
 from .types import OPTIONS, scalar_types
 
 # Points of a pair of sharp shapes; corners of one cap on a plane; room for the corners of a face while it is clipped.
@@ -50,7 +50,10 @@ def clipping(real) -> SimpleNamespace:
         slack: real,
         name: int,
     ) -> int:
-        """Keep what has m . x <= c; two points are a line. edges: which line leads from a corner to the next. Returns the new count."""
+        """Keep what has m . x <= c; two points are a line. Returns the new count.
+
+        edges: which line leads from a corner to the next; of the ends of a line, what ends it.
+        """
         most = real(0.0)
         for k in range(count):
             most = wp.max(most, wp.dot(m, points[k]) - c)
@@ -69,7 +72,7 @@ def clipping(real) -> SimpleNamespace:
             if (here <= slack) != (there <= slack) and kept < CLIPPED and not (count == 2 and k == 1):
                 spare[kept] = p + wp.clamp(here / (here - there), real(0.0), real(1.0)) * (q - p)
                 spare_edges[kept] = edges[k]
-                if here <= slack:
+                if here <= slack or count == 2:
                     spare_edges[kept] = name
                 kept += 1
             if kept == CLIPPED:
@@ -77,6 +80,30 @@ def clipping(real) -> SimpleNamespace:
         for k in range(kept):
             points[k] = spare[k]
             edges[k] = spare_edges[k]
+        return kept
+
+    @wp.func
+    def unseamed(points: wp.array(dtype=vec3), edges: wp.array(dtype=int), count: int, own: int, others: int) -> int:
+        """Leave out corners at seams, beyond which the surface goes on. own, others: bits of sides, named from ROUND and from 0."""
+        kept = int(0)
+        last = int(0)
+        if count > 0:
+            last = edges[count - 1]
+        for k in range(count):
+            seam = bool(False)
+            for m in range(2):
+                edge = edges[k]
+                if m == 1 and count > 2:
+                    edge = last
+                if edge >= ROUND and edge < ROUND + 3:
+                    seam = seam or (own & (1 << (edge - ROUND))) != 0
+                elif edge < 3:
+                    seam = seam or (others & (1 << edge)) != 0
+            last = edges[k]
+            if not seam:
+                points[kept] = points[k]
+                edges[kept] = edges[k]
+                kept += 1
         return kept
 
     @wp.func
@@ -109,7 +136,7 @@ def clipping(real) -> SimpleNamespace:
                 kept += 1
         return kept
 
-    return SimpleNamespace(clip=clip, spread=spread)
+    return SimpleNamespace(clip=clip, spread=spread, unseamed=unseamed)
 
 
 @functools.cache
@@ -120,6 +147,7 @@ def meeting(real):
     a, s, c = axes(real), functions(real), clipping(real)
     rank, Hulls, support, part, face_towards, face_normal = a.rank, s.Hulls, s.support, s.part, s.face_towards, s.face_normal
     turned, turned_to, sides, side_plane, clip, spread = s.turned, s.turned_to, s.sides, s.side_plane, c.clip, c.spread
+    unseamed = c.unseamed
 
     @wp.func
     def smallest_size(hulls: Hulls, shape: int, size: vec3) -> real:
@@ -193,6 +221,7 @@ def meeting(real):
         spare = wp.zeros(shape=(CLIPPED,), dtype=vec3)
         spare_edges = wp.zeros(shape=(CLIPPED,), dtype=int)
         count = int(0)
+        bare = bool(True)  # is nothing over the face?
         if owner > 0:
             # In the frame of the face's owner; the other shape is where they meet, if it comes from the side.
             one = a
@@ -230,6 +259,12 @@ def meeting(real):
                 m = vec3(plane[0], plane[1], plane[2])
                 if count > 0:
                     count = clip(points, edges, spare, spare_edges, count, m, plane[3], real(SLACK) * scale, ROUND + k)
+            bare = count == 0
+            if hulls.kind[one] == PIECE:
+                count = unseamed(points, edges, count, hulls.seam[face], 0)
+            elif hulls.kind[other] == PIECE:
+                turned_face = face_towards(hulls, other, wp.transpose(other_turn) * (-out))
+                count = unseamed(points, edges, count, 0, hulls.seam[turned_face])
             count = spread(points, edges, count, out)
             level = wp.dot(out, support(hulls, one, size_one, out))
             normal[0] = wp.transform_vector(pose, out)
@@ -241,7 +276,7 @@ def meeting(real):
                 at[k] = wp.transform_point(pose, points[k] - real(0.5) * gap * out - part_way * along)
                 gaps[k] = gap
                 features[k] = (((owner * 4099 + face) * 67 + before) * 67 + edges[k]) & 0x3FFFFFFF
-        if count == 0:
+        if bare:
             # Edges cross, lines lie side by side, or nothing is over the face: one that is only as good as the best axis is not it.
             normal[0] = wp.transform_vector(xa, n)
             line_a = int(0)

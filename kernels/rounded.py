@@ -19,7 +19,7 @@ import warp as wp
 
 from .capsule import covered_within
 from .collide import NO_POINT, pair_functions
-from .shapes import functions
+from .shapes import PIECE, functions
 from .types import OPTIONS, scalar_types
 
 # Of the size: a core closer than this to the other shape has no direction of its own to it.
@@ -181,17 +181,164 @@ def distance(real) -> SimpleNamespace:
 
 
 @functools.cache
+def meeting(real):
+    """Function ``meet``: where a ball or capsule touches a convex shape, or could."""
+    t = scalar_types(real)
+    vec3, transform, spatial = t.vec3, t.transform, t.spatial
+    f, s = pair_functions(real), functions(real)
+    bend, rotation, Hulls, part, face_towards, face_normal = f.bend, f.rotation, s.Hulls, s.part, s.face_towards, s.face_normal
+    sides, side_plane, turned = s.sides, s.side_plane, s.turned
+    nearest = distance(real).nearest
+
+    @wp.func
+    def velocity(twist: spatial, arm: vec3) -> vec3:
+        return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
+
+    @wp.func
+    def carried(twist: spatial, arm: vec3, h: real) -> vec3:
+        """How far a point is carried in h, world axes."""
+        return h * wp.spatial_top(twist) + (wp.quat_rotate(rotation(h * wp.spatial_bottom(twist)), arm) - arm)
+
+    @wp.func
+    def meet(
+        hulls: Hulls,
+        a: int,
+        b: int,
+        size_a: vec3,
+        size_b: vec3,
+        xa: transform,
+        xb: transform,
+        com_a: vec3,
+        com_b: vec3,
+        twist_a: spatial,
+        twist_b: spatial,
+        half: real,
+        near: real,
+        h: real,
+        normals: wp.array(dtype=vec3),
+        at: wp.array(dtype=vec3),
+        gaps: wp.array(dtype=real),
+        bends: wp.array(dtype=real),
+        features: wp.array(dtype=int),
+    ):
+        """Fills three contacts, those of a capsule's ends and its nearest point, or the first alone where half, of its core, is zero.
+
+        World axes; the gap is NO_POINT where there is none. near: how far from each other the core and b still matter, m.
+        """
+        number = int(1)
+        if half > real(0.0):
+            number = 3
+        for k in range(number):
+            gaps[k] = real(NO_POINT)
+        radius = size_a[0]
+        turn = wp.transform_get_rotation(xb)
+        inverse = wp.transform_inverse(xb)
+        c = wp.transform_point(inverse, wp.transform_get_translation(xa))
+        e = wp.transform_vector(inverse, wp.transform_vector(xa, vec3(real(0.0), real(0.0), real(1.0))))
+        further = rotation(wp.quat_rotate_inv(turn, h * wp.spatial_bottom(twist_b)))
+        frame_move = carried(twist_b, wp.transform_get_translation(xb) - com_b, h)
+        # The nearest point of all comes first, then both ends, as balls.
+        low = -half
+        high = half
+        low_end = int(0)
+        high_end = int(0)
+        least = real(1.0e30)
+        looking = bool(True)
+        for k in range(number):
+            x = real(0.0)
+            length = half
+            feature = int(0)
+            to = int(0)
+            if number > 1:
+                to = (k + 2) % 3
+            if k == 1:
+                x = low
+                feature = low_end
+                length = real(0.0)
+            elif k == 2:
+                x = high
+                feature = high_end
+                length = real(0.0)
+            found = nearest(hulls, b, size_b, c + x * e, e, length)
+            away = wp.length(found.way)
+            if away > near:
+                if k == 0:
+                    looking = False
+            elif away > real(0.0) and looking:
+                way = found.way / away
+                x += found.at
+                normal = wp.transform_vector(xb, way)
+                gap = away - radius
+                core = wp.transform_point(xb, c + x * e)
+                closing = h * (velocity(twist_a, core - com_a) - velocity(twist_b, core - com_b))
+                move = carried(twist_a, core - com_a, h) - frame_move
+                ahead = wp.quat_rotate_inv(further, c + x * e + wp.quat_rotate_inv(turn, move))
+                then = nearest(hulls, b, size_b, ahead, e, real(0.0))
+                way_ahead = -wp.quat_rotate(turn, wp.quat_rotate(further, then.way))
+                normals[to] = normal
+                at[to] = wp.transform_point(xb, found.point) - normal * (real(0.5) * gap)
+                gaps[to] = gap
+                bends[to] = bend(gap, away, -normal, closing, wp.length(then.way), way_ahead)
+                features[to] = feature
+                if k == 0 and number > 1:
+                    least = gap
+                    # What of the core lies over a face, or along a round side.
+                    face = face_towards(hulls, b, -way)
+                    if -wp.dot(way, face_normal(hulls, b, face)) > real(OVER):
+                        for m in range(sides(hulls, b, face)):
+                            plane = side_plane(hulls, b, size_b, face, m)
+                            n = vec3(plane[0], plane[1], plane[2])
+                            slope = wp.dot(n, e)
+                            over = wp.dot(n, c) - plane[3]
+                            if slope > real(1.0e-6) and -over / slope < high and -over / slope > low:
+                                high = -over / slope
+                                high_end = 1 + m
+                            elif slope < real(-1.0e-6) and -over / slope > low and -over / slope < high:
+                                low = -over / slope
+                                low_end = 1 + m
+                    elif turned(hulls.kind[b]) and wp.abs(e[2]) > real(OVER):
+                        one = (-size_b[1] - c[2]) / e[2]
+                        two = (size_b[1] - c[2]) / e[2]
+                        if one > two:
+                            x = one
+                            one = two
+                            two = x
+                        if one > low and one < high:
+                            low = one
+                            low_end = 1
+                        if two < high and two > low:
+                            high = two
+                            high_end = 2
+            elif k == 0:
+                # The core is inside, or in the plane of a triangle, which it leaves on that one's outside.
+                looking = False
+                if hulls.kind[b] == PIECE:
+                    normals[to] = -wp.transform_vector(xb, hulls.normal[hulls.first_face[b]])
+                    at[to] = wp.transform_point(xb, c)
+                    gaps[to] = -radius
+                else:
+                    d = wp.transform_point(wp.transform_inverse(xa), wp.transform_get_translation(xb))
+                    axes_b = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(xa))) * wp.quat_to_matrix(turn)
+                    out = part(hulls, a, b, size_a, size_b, d, axes_b, vec3(), wp.length(size_a) + wp.length(size_b))
+                    gaps[to] = out.separation - radius
+                    normals[to] = wp.transform_vector(xa, out.normal)
+                    at[to] = wp.transform_point(xa, out.point) + normals[to] * (radius + real(0.5) * gaps[to])
+                bends[to] = real(0.0)
+                features[to] = 1
+        if number > 1 and looking and least > wp.min(gaps[0], gaps[1]) - real(wp.static(covered_within(real))) * radius:
+            gaps[2] = real(NO_POINT)
+
+    return meet
+
+
+@functools.cache
 def make(real):
     """Kernel ``rounded``; launch with dim (E, pairs of a kind)."""
     t = scalar_types(real)
-    vec3 = t.vec3
+    vec3, spatial = t.vec3, t.spatial
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
-    f, s = pair_functions(real), functions(real)
-    shape_pose, reach, shape_velocity, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write_bent
-    far_apart, set_apart, bend, shape_turn, rotation, shift = f.far_apart, f.set_apart, f.bend, f.shape_turn, f.rotation, f.shift
-    Hulls, part, face_towards, face_normal = s.Hulls, s.part, s.face_towards, s.face_normal
-    sides, side_plane, turned = s.sides, s.side_plane, s.turned
-    nearest = distance(real).nearest
+    f, Hulls, meet = pair_functions(real), functions(real).Hulls, meeting(real)
+    shape_pose, reach, write_bent, far_apart, set_apart = f.shape_pose, f.reach, f.write_bent, f.far_apart, f.set_apart
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def rounded(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int):
@@ -205,111 +352,37 @@ def make(real):
                 continue
             slot = topology.pair_slots[pair]
             number = topology.pair_slots[pair + 1] - slot
-            for k in range(number):
-                slots.gap[env, slot + k] = real(NO_POINT)
-            size = topology.shape_size[sb]
-            radius = topology.shape_size[sa][0]
+            size_a = topology.shape_size[sa]
+            size_b = topology.shape_size[sb]
             half = real(0.0)
             if number > 1:
-                half = topology.shape_size[sa][1]
+                half = size_a[1]
             xa = shape_pose(topology, bodies, env, sa)
             xb = shape_pose(topology, bodies, env, sb)
-            turn = wp.transform_get_rotation(xb)
-            inverse = wp.transform_inverse(xb)
-            c = wp.transform_point(inverse, wp.transform_get_translation(xa))
-            e = wp.transform_vector(inverse, wp.transform_vector(xa, vec3(real(0.0), real(0.0), real(1.0))))
-            further = rotation(wp.quat_rotate_inv(turn, shape_turn(topology, bodies, env, sb, h)))
-            carried = shift(topology, bodies, env, sb, wp.transform_get_translation(xb), h)
-            near = radius + reach(topology, bodies, env, sa, wp.transform_get_translation(xa), radius + half, h)
-            near += reach(topology, bodies, env, sb, wp.transform_get_translation(xb), wp.length(size), h)
-
-            # The nearest point of all comes first, then both ends, as balls.
-            low = -half
-            high = half
-            low_end = int(0)
-            high_end = int(0)
-            least = real(1.0e30)
-            looking = bool(True)
+            near = size_a[0] + reach(topology, bodies, env, sa, wp.transform_get_translation(xa), size_a[0] + half, h)
+            near += reach(topology, bodies, env, sb, wp.transform_get_translation(xb), wp.length(size_b), h)
+            com_a = vec3()
+            com_b = vec3()
+            twist_a = spatial()
+            twist_b = spatial()
+            body_a = topology.shape_body[sa]
+            body_b = topology.shape_body[sb]
+            if body_a >= 0:
+                com_a = bodies.com[env, body_a]
+                twist_a = bodies.velocity[env, body_a]
+            if body_b >= 0:
+                com_b = bodies.com[env, body_b]
+                twist_b = bodies.velocity[env, body_b]
+            normals = wp.zeros(shape=(3,), dtype=vec3)
+            at = wp.zeros(shape=(3,), dtype=vec3)
+            gaps = wp.zeros(shape=(3,), dtype=real)
+            bends = wp.zeros(shape=(3,), dtype=real)
+            features = wp.zeros(shape=(3,), dtype=int)
+            meet(hulls, sa, sb, size_a, size_b, xa, xb, com_a, com_b, twist_a, twist_b, half, near, h, normals, at, gaps, bends, features)
             for k in range(number):
-                x = real(0.0)
-                length = half
-                feature = int(0)
-                to = slot
-                if number > 1:
-                    to = slot + (k + 2) % 3
-                if k == 1:
-                    x = low
-                    feature = low_end
-                    length = real(0.0)
-                elif k == 2:
-                    x = high
-                    feature = high_end
-                    length = real(0.0)
-                found = nearest(hulls, sb, size, c + x * e, e, length)
-                away = wp.length(found.way)
-                if away > near:
-                    if k == 0:
-                        looking = False
-                elif away > real(0.0) and looking:
-                    way = found.way / away
-                    x += found.at
-                    normal = wp.transform_vector(xb, way)
-                    gap = away - radius
-                    core = wp.transform_point(xb, c + x * e)
-                    u = shape_velocity(topology, bodies, bodies.velocity, env, sa, core)
-                    closing = h * (u - shape_velocity(topology, bodies, bodies.velocity, env, sb, core))
-                    move = shift(topology, bodies, env, sa, core, h) - carried
-                    ahead = wp.quat_rotate_inv(further, c + x * e + wp.quat_rotate_inv(turn, move))
-                    then = nearest(hulls, sb, size, ahead, e, real(0.0))
-                    way_ahead = -wp.quat_rotate(turn, wp.quat_rotate(further, then.way))
-                    left = bend(gap, away, -normal, closing, wp.length(then.way), way_ahead)
-                    point = wp.transform_point(xb, found.point) - normal * (real(0.5) * gap)
-                    write_bent(slots, env, to, point, normal, gap, left, feature)
-                    if k == 0 and number > 1:
-                        least = gap
-                        # What of the core lies over a face, or along a round side.
-                        kind = hulls.kind[sb]
-                        face = face_towards(hulls, sb, -way)
-                        if -wp.dot(way, face_normal(hulls, sb, face)) > real(OVER):
-                            for m in range(sides(hulls, sb, face)):
-                                plane = side_plane(hulls, sb, size, face, m)
-                                n = vec3(plane[0], plane[1], plane[2])
-                                slope = wp.dot(n, e)
-                                over = wp.dot(n, c) - plane[3]
-                                if slope * half > real(1.0e-6) * half and -over / slope < high and -over / slope > low:
-                                    high = -over / slope
-                                    high_end = 1 + m
-                                elif slope * half < real(-1.0e-6) * half and -over / slope > low and -over / slope < high:
-                                    low = -over / slope
-                                    low_end = 1 + m
-                        elif turned(kind) and wp.abs(e[2]) > real(OVER):
-                            one = (-size[1] - c[2]) / e[2]
-                            two = (size[1] - c[2]) / e[2]
-                            if one > two:
-                                x = one
-                                one = two
-                                two = x
-                            if one > low and one < high:
-                                low = one
-                                low_end = 1
-                            if two < high and two > low:
-                                high = two
-                                high_end = 2
-                elif k == 0:
-                    # The core is inside.
-                    looking = False
-                    into = wp.transform_inverse(xa)
-                    d = wp.transform_point(into, wp.transform_get_translation(xb))
-                    axes_b = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(xa))) * wp.quat_to_matrix(turn)
-                    size_a = topology.shape_size[sa]
-                    out = part(hulls, sa, sb, size_a, size, d, axes_b, vec3(), wp.length(size_a) + wp.length(size))
-                    normal = wp.transform_vector(xa, out.normal)
-                    gap = out.separation - radius
-                    point = wp.transform_point(xa, out.point) + normal * (radius + real(0.5) * gap)
-                    write_bent(slots, env, to, point, normal, gap, real(0.0), 1)
-            if number > 1 and looking:
-                ends = wp.min(slots.gap[env, slot], slots.gap[env, slot + 1])
-                if least > ends - real(wp.static(covered_within(real))) * radius:
-                    slots.gap[env, slot + 2] = real(NO_POINT)
+                if gaps[k] < real(NO_POINT):
+                    write_bent(slots, env, slot + k, at[k], normals[k], gaps[k], bends[k], features[k])
+                else:
+                    slots.gap[env, slot + k] = real(NO_POINT)
 
     return rounded

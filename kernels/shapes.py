@@ -17,6 +17,7 @@ SPHERE = wp.constant(1)
 CAPSULE = wp.constant(3)
 CYLINDER = wp.constant(4)
 CONE = wp.constant(5)
+PIECE = wp.constant(8)  # a triangle of a mesh: a hull without thickness
 # Sides of the polygon inside a round cap to which faces are clipped, and corners of that which lands on a face.
 ROUND = 16
 CORNERS = 8
@@ -46,6 +47,12 @@ def functions(real) -> SimpleNamespace:
         normal: wp.array(dtype=vec3)  # [F] outward
         first_corner: wp.array(dtype=int)  # [F + 1]
         corner: wp.array(dtype=int)  # into point, counterclockwise from outside
+        seam: wp.array(dtype=int)  # [F] bit k: side k of a triangle goes on in another one, in the same plane
+        # Triangles of meshes: each is a hull too, numbered from S on, in a frame about its own centre.
+        mesh: wp.array(dtype=wp.uint64)  # [S] where to look for the triangles near a point, zero for other shapes
+        first_piece: wp.array(dtype=int)  # [S + 1]
+        centre: wp.array(dtype=vec3)  # [T] of a triangle, in the frame of the mesh
+        radius: wp.array(dtype=real)  # [T] of the ball around its centre that holds it
 
     @wp.struct
     class Axis:
@@ -58,7 +65,10 @@ def functions(real) -> SimpleNamespace:
     @wp.func
     def turned(kind: int) -> bool:
         """Is it round about its z axis, with a cap?"""
-        return kind == CYLINDER or kind == CONE
+        result = kind == CYLINDER
+        if kind == CONE:
+            result = True
+        return result
 
     @wp.func
     def support(hulls: Hulls, shape: int, size: vec3, d: vec3) -> vec3:
@@ -91,26 +101,37 @@ def functions(real) -> SimpleNamespace:
             p = hulls.point[best]
         return p
 
+    @wp.struct
+    class Facet:
+        """A triangle of the growing polytope. Its normal is zero, and its offset huge, where it has no area: it is never nearest."""
+
+        corner: wp.vec3i
+        beside: wp.vec3i  # the facet across the side from corner m to the next
+        normal: vec3
+        offset: real
+
     @wp.func
-    def set_face(
-        w: wp.array(dtype=vec3),
-        corners: wp.array(dtype=wp.vec3i),
-        normals: wp.array(dtype=vec3),
-        offsets: wp.array(dtype=real),
-        face: int,
-        corner: wp.vec3i,
-        least: real,
-    ):
-        """A face of the polytope; one without area is never nearest."""
+    def facet(w: wp.array(dtype=vec3), corner: wp.vec3i, beside: wp.vec3i, least: real) -> Facet:
+        result = Facet()
+        result.corner = corner
+        result.beside = beside
         origin = w[corner[0]]
         n = wp.cross(w[corner[1]] - origin, w[corner[2]] - origin)
         length = wp.length(n)
-        corners[face] = corner
-        normals[face] = vec3()
-        offsets[face] = real(1.0e30)
+        result.offset = real(1.0e30)
         if length > least:
-            normals[face] = n / length
-            offsets[face] = wp.dot(n, origin) / length
+            result.normal = n / length
+            result.offset = wp.dot(result.normal, origin)
+        return result
+
+    @wp.func
+    def side_to(f: Facet, other: int) -> int:
+        """Which side of a facet is another one's."""
+        result = int(0)
+        for m in range(1, 3):
+            if f.beside[m] == other:
+                result = m
+        return result
 
     @wp.func
     def part(hulls: Hulls, a: int, b: int, size_a: vec3, size_b: vec3, d: vec3, turn: mat33, move: vec3, scale: real) -> Axis:
@@ -125,10 +146,11 @@ def functions(real) -> SimpleNamespace:
         """
         w = wp.zeros(shape=(VERTICES,), dtype=vec3)  # points of A - B
         on_a = wp.zeros(shape=(VERTICES,), dtype=vec3)
-        corners = wp.zeros(shape=(FACES,), dtype=wp.vec3i)
-        normals = wp.zeros(shape=(FACES,), dtype=vec3)
-        offsets = wp.zeros(shape=(FACES,), dtype=real)
-        rim = wp.zeros(shape=(VERTICES,), dtype=wp.vec2i)
+        facets = wp.zeros(shape=(FACES,), dtype=Facet)
+        state = wp.zeros(shape=(FACES,), dtype=int)  # 0 none, 1 of the polytope, 2 seen from the new point
+        rim = wp.zeros(shape=(VERTICES,), dtype=wp.vec2i)  # facets around what is seen, and which side of theirs is to it
+        ahead = wp.zeros(shape=(FACES,), dtype=wp.vec2i)
+        places = wp.zeros(shape=(VERTICES,), dtype=int)
         flat = real(wp.static(FLAT[real])) * scale
         least = real(wp.static(1.0e-14 if real is wp.float64 else 1.0e-7)) * scale * scale
         # Four points that span a volume: both ends of an axis, what is furthest from it, what is furthest from all three.
@@ -162,7 +184,6 @@ def functions(real) -> SimpleNamespace:
                 w[count] = q
                 on_a[count] = p
                 count += 1
-        faces = int(4)
         for k in range(4):
             i = (k + 1) % 4
             j = (k + 2) % 4
@@ -170,60 +191,88 @@ def functions(real) -> SimpleNamespace:
             if wp.dot(wp.cross(w[j] - w[i], w[m] - w[i]), w[k] - w[i]) > real(0.0):
                 i = j
                 j = (k + 1) % 4
-            set_face(w, corners, normals, offsets, k, wp.vec3i(i, j, m), least)
+            # Across a side is the facet without the corner that is not on it, which has that corner's number.
+            facets[k] = facet(w, wp.vec3i(i, j, m), wp.vec3i(m, i, j), least)
+            state[k] = 1
+        used = int(4)  # facets are numbered below this
         nearest = int(0)
         growing = bool(True)
         while growing:
-            nearest = int(0)
             nearness = real(1.0e30)
-            for k in range(faces):
-                along = offsets[k] - wp.dot(normals[k], move)
-                if along < nearness:
-                    nearness = along
-                    nearest = k
-            n = normals[nearest]
+            for k in range(used):
+                if state[k] == 1:
+                    along = facets[k].offset - wp.dot(facets[k].normal, move)
+                    if along < nearness:
+                        nearness = along
+                        nearest = k
+            n = facets[nearest].normal
             p = support(hulls, a, size_a, n)
             q = p - d - turn * support(hulls, b, size_b, wp.transpose(turn) * (-n))
-            growing = wp.dot(n, q) - offsets[nearest] > flat and count < VERTICES and faces < FACES - 8
+            growing = wp.dot(n, q) - facets[nearest].offset > flat and count < VERTICES
             if growing:
-                w[count] = q
-                on_a[count] = p
+                # What the new point sees, from the nearest facet on, and the rim of that in order.
                 edges = int(0)
-                k = int(0)
-                while k < faces:
-                    if wp.dot(normals[k], q) - offsets[k] > real(0.1) * flat:
-                        # What the new point sees goes; an edge that goes twice is inside of it.
-                        for m in range(3):
-                            edge = wp.vec2i(corners[k][m], corners[k][(m + 1) % 3])
-                            twin = int(-1)
-                            for i in range(edges):
-                                if rim[i][0] == edge[1] and rim[i][1] == edge[0]:
-                                    twin = i
-                            if twin >= 0:
-                                edges -= 1
-                                rim[twin] = rim[edges]
-                            elif edges < VERTICES:
-                                rim[edges] = edge
-                                edges += 1
-                        faces -= 1
-                        corners[k] = corners[faces]
-                        normals[k] = normals[faces]
-                        offsets[k] = offsets[faces]
-                    else:
-                        k += 1
+                waiting = int(0)
+                state[nearest] = 2
+                for m in range(3):
+                    beside = facets[nearest].beside[2 - m]
+                    ahead[waiting] = wp.vec2i(beside, side_to(facets[beside], nearest))
+                    waiting += 1
+                while waiting > 0:
+                    waiting -= 1
+                    k = ahead[waiting][0]
+                    side = ahead[waiting][1]
+                    if state[k] == 1:
+                        if wp.dot(facets[k].normal, q) - facets[k].offset > real(0.1) * flat:
+                            state[k] = 2
+                            for m in range(2):
+                                beside = facets[k].beside[(side + 2 - m) % 3]
+                                if waiting < FACES:
+                                    ahead[waiting] = wp.vec2i(beside, side_to(facets[beside], k))
+                                    waiting += 1
+                        elif edges < VERTICES:
+                            rim[edges] = wp.vec2i(k, side)
+                            edges += 1
+                # Each side of the rim gets a facet with the new point: in place of what is seen, then behind the others.
+                closed = edges >= 3 and edges < VERTICES
+                free = int(0)
                 for i in range(edges):
-                    if faces < FACES:
-                        set_face(w, corners, normals, offsets, faces, wp.vec3i(rim[i][0], rim[i][1], count), least)
-                        faces += 1
-                count += 1
+                    here = facets[rim[i][0]].corner[rim[i][1]]
+                    next_rim = rim[(i + 1) % edges]
+                    there = facets[next_rim[0]].corner[(next_rim[1] + 1) % 3]
+                    closed = closed and here == there
+                    while free < used and state[free] == 1:
+                        free += 1
+                    places[i] = free
+                    free += 1
+                    used = wp.max(used, wp.min(free, FACES))
+                    closed = closed and free <= FACES
+                growing = closed  # rounding has spoilt the polytope, or it is as large as it may be: its last axis is good enough
+                if growing:
+                    for k in range(used):
+                        if state[k] == 2:
+                            state[k] = 0
+                    w[count] = q
+                    on_a[count] = p
+                    for i in range(edges):
+                        k = rim[i][0]
+                        side = rim[i][1]
+                        corner = wp.vec3i(facets[k].corner[(side + 1) % 3], facets[k].corner[side], count)
+                        outer = facets[k]
+                        outer.beside[side] = places[i]
+                        facets[k] = outer
+                        before = places[(i + edges - 1) % edges]
+                        facets[places[i]] = facet(w, corner, wp.vec3i(k, places[(i + 1) % edges], before), least)
+                        state[places[i]] = 1
+                    count += 1
         result = Axis()
         result.normal = n
         result.separation = -wp.dot(n, q)
         # Where the origin lies over the facet; the other half of a facet of four corners counts on.
-        c = corners[nearest]
+        c = facets[nearest].corner
         e_1 = w[c[1]] - w[c[0]]
         e_2 = w[c[2]] - w[c[0]]
-        r = n * offsets[nearest] - w[c[0]]
+        r = n * facets[nearest].offset - w[c[0]]
         area = wp.dot(n, wp.cross(e_1, e_2))
         s_1 = real(0.0)
         s_2 = real(0.0)

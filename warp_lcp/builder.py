@@ -13,7 +13,7 @@ import numpy as np
 from . import hulls, joints
 from .errors import ModelError, positive_number
 from .joints import AXES, Joint
-from .model import CONTACT_POINTS, JOINT_AXES, DofKind, Drive, Hull, JointType, Material, Model, Report, ShapeType
+from .model import CONTACT_POINTS, JOINT_AXES, DofKind, Drive, Hull, JointType, Material, Mesh, Model, Report, ShapeType
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 NO_LIMIT, NO_DRIVE = (-np.inf, np.inf), (0.0, 0.0, np.inf, 0.0, 0.0)
@@ -54,12 +54,12 @@ class _Shape:
     material: Material
     density: float
     surface_velocity: np.ndarray
-    hull: Hull | None
+    hull: Hull | Mesh | None
 
     def solid(self) -> tuple[float, np.ndarray, np.ndarray]:
         """Volume, centre of mass [3] and inertia [3, 3] per unit mass about it, in the shape's frame."""
         centre, (r, h) = np.zeros(3), self.size[:2]
-        if self.hull is not None:
+        if isinstance(self.hull, Hull):
             return hulls.solid(self.hull)
         if self.type is ShapeType.BOX:
             s = self.size**2
@@ -313,10 +313,29 @@ class ModelBuilder:
             MissingExtra: no scipy is installed (the extra 'mesh').
         """
         hull, _ = hulls.convex_hull(options.get("name") or f"shape{len(self._shapes)}", points)
-        low, high = hull.points.min(axis=0), hull.points.max(axis=0)
-        pose = joints.compose(_pose("hull", pose), np.r_[0.5 * (low + high), 0.0, 0.0, 0.0, 1.0])
-        hull = Hull(hull.points - 0.5 * (low + high), hull.faces)
-        return self._add_shape(ShapeType.HULL, body, pose, 0.5 * (high - low), hull=hull, **options)
+        middle, size = _bounds(hull.points)
+        where = joints.compose(_pose("hull", pose), np.r_[middle, IDENTITY[3:]]).tolist()
+        return self._add_shape(ShapeType.HULL, body, where, size, hull=Hull(hull.points - middle, hull.faces), **options)
+
+    def add_mesh(self, body: int, points: Any, triangles: Any, *, pose: Sequence[float] = IDENTITY, **options) -> int:
+        """Add a mesh of triangles that no force moves, as ground; ``options`` as for :meth:`add_box`, except density.
+
+        What touches a triangle leaves it on the side on which it is; two meshes pass through each other.
+
+        Args:
+            body: owner: the world (-1), a fixed or a kinematic body.
+            points: [V, 3] m, in the frame of ``pose``.
+            triangles: [T, 3] of them.
+            pose: in the owner's frame. The frame of the shape itself is in the middle of the mesh's bounds.
+
+        Raises:
+            ModelError: for a mesh that could move, or triangles that are none.
+        """
+        name = options.get("name") or f"shape{len(self._shapes)}"
+        mesh = hulls.mesh(name, points, triangles)
+        middle, size = _bounds(mesh.points)
+        where = joints.compose(_pose("mesh", pose), np.r_[middle, IDENTITY[3:]]).tolist()
+        return self._add_shape(ShapeType.MESH, body, where, size, hull=Mesh(mesh.points - middle, mesh.triangles), **options)
 
     def add_box(
         self,
@@ -358,13 +377,15 @@ class ModelBuilder:
         material: Material | None = None,
         density: float = 1000.0,
         surface_velocity: Sequence[float] = (0.0, 0.0, 0.0),
-        hull: Hull | None = None,
+        hull: Hull | Mesh | None = None,
     ) -> int:
         name = f"shape{len(self._shapes)}" if name is None else name
         if not -1 <= body < len(self._bodies):
             raise ModelError(f"{name}: body {body} does not exist; add_body returns the index to give here")
         if kind is ShapeType.PLANE and body >= 0 and self._bodies[body].joint is JointType.FREE:
             raise ModelError(f"{name}: a plane is infinite and cannot move freely; put it on the world, a fixed or a kinematic body")
+        if kind is ShapeType.MESH and body >= 0 and self._bodies[body].joint is JointType.FREE:
+            raise ModelError(f"{name}: a mesh of triangles cannot move freely; use add_hull, or put it on the world or a kinematic body")
         material = Material() if material is None else material
         _check_material(name, material)
         _positive(f"{name}: density", density, "kg/m^3")
@@ -476,7 +497,7 @@ class ModelBuilder:
         body = self._bodies[index]
         parts = []
         for s in self._shapes:
-            if s.body == index and s.type is not ShapeType.PLANE:
+            if s.body == index and s.type not in (ShapeType.PLANE, ShapeType.MESH):
                 (volume, centre, inertia), rot = s.solid(), rotation_matrix(s.pose[3:])
                 m = s.density * volume
                 parts.append((m, s.pose[:3] + rot @ centre, m * rot @ inertia @ rot.T))
@@ -514,6 +535,12 @@ class ModelBuilder:
                 if kind in CONTACT_POINTS:
                     pairs.append((*kind, first, second))
         return np.array([p[2:] for p in sorted(pairs)], dtype=np.int32).reshape(-1, 2)
+
+
+def _bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and half extents [3] of a box around points."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return 0.5 * (low + high), 0.5 * (high - low)
 
 
 def _per_axis(what: str, value: float | Sequence[float], n: int) -> np.ndarray:

@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convex hulls: of points (by Qhull, in scipy), their mass, and the arrays that kernels read."""
+"""Convex hulls (by Qhull, in scipy) and meshes: checked, their mass, and the arrays that kernels read."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from .errors import MissingExtra, ModelError
-from .model import Hull, Model, ShapeType
+from .model import Hull, Mesh, Model, ShapeType
 
 #: Points that a hull may have; of more, those are left out that change it least.
 MAX_POINTS = 64
 #: Of the size: corners of a face lie in its plane to within this, and what is thinner is flat.
 FLAT = 1e-9
+#: Sine of the angle by which triangles that go on in one plane may differ, what single precision leaves of a plane.
+SEAM = 1e-5
 #: A box from -1 to 1: its corners, and its faces counterclockwise from outside.
 CORNERS = np.array([[x, y, z] for z in (-1.0, 1.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
 BOX_FACES = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6))
@@ -72,6 +75,28 @@ def _faces(points: np.ndarray, hull: Any, place: np.ndarray, size: float) -> lis
     return faces
 
 
+def mesh(name: str, points: Any, triangles: Any) -> Mesh:
+    """A checked mesh, without triangles that have no area.
+
+    Raises:
+        ModelError: for points that are not finite, corners that are none, or no triangle with an area.
+    """
+    points, corners = np.asarray(points, dtype=float), np.asarray(triangles)
+    if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
+        raise ModelError(f"{name}: points have shape {points.shape}; give [V, 3] finite numbers")
+    if corners.ndim != 2 or corners.shape[1:] != (3,) or corners.dtype.kind not in "iu":
+        raise ModelError(f"{name}: triangles have shape {corners.shape} of {corners.dtype}; give [T, 3] whole numbers")
+    if corners.size and (corners.min() < 0 or corners.max() >= len(points)):
+        raise ModelError(f"{name}: a triangle has corner {corners.min() if corners.min() < 0 else corners.max()} of {len(points)} points")
+    p = points[corners]
+    area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
+    longest = np.ptp(p, axis=1).max(axis=1) if len(p) else np.zeros(0)
+    corners = corners[area > FLAT * longest**2]
+    if not len(corners):
+        raise ModelError(f"{name}: no triangle has an area")
+    return Mesh(points, corners.astype(np.int32))
+
+
 def solid(hull: Hull) -> tuple[float, np.ndarray, np.ndarray]:
     """Volume, centre of mass and inertia [3, 3] per unit mass about it, by tetrahedra from one of its points."""
     triangles = [(face[0], face[k], face[k + 1]) for face in hull.faces for k in range(1, len(face) - 1)]
@@ -87,24 +112,73 @@ def solid(hull: Hull) -> tuple[float, np.ndarray, np.ndarray]:
     return volume, origin + centre, np.trace(second) * np.eye(3) - second
 
 
-def arrays(model: Model, sim: Any) -> Any:
-    """``shapes.Hulls`` of a Simulator: of the shapes in pairs with cylinders, cones and hulls, boxes as hulls."""
+def arrays(model: Model, sim: Any) -> tuple[Any, list[wp.Mesh]]:
+    """``shapes.Hulls`` of a Simulator, and the trees of triangles that it refers to: boxes are hulls in it, and so are triangles."""
     from .kernels import shapes
 
-    vec3, empty = sim._types.vec3, Hull(np.zeros((0, 3)), ())
-    hulls = []
-    for kind, size, hull in zip(model.shape_type, model.shape_size, model.shape_hull, strict=True):
-        hulls.append(Hull(CORNERS * size, BOX_FACES) if kind == ShapeType.BOX else hull or empty)
-    result = shapes.functions(sim.real).Hulls()
+    hulls, pieces, trees = [], [], []
+    for kind, size, shape in zip(model.shape_type, model.shape_size, model.shape_hull, strict=True):
+        corners = shape.points[shape.triangles] if isinstance(shape, Mesh) else np.zeros((0, 3, 3))
+        pieces.append(corners)
+        trees.append(_tree(shape, sim.device) if isinstance(shape, Mesh) else None)
+        empty = Hull(np.zeros((0, 3)), ())
+        hulls.append(Hull(CORNERS * size, BOX_FACES) if kind == ShapeType.BOX else shape if isinstance(shape, Hull) else empty)
+    centres = np.concatenate(pieces).mean(axis=1)
+    sides = ((0, 1, 2), (2, 1, 0))
+    hulls += [Hull(corners - corners.mean(axis=0), sides) for corners in np.concatenate(pieces)]
+    vec3, result = sim._types.vec3, shapes.functions(sim.real).Hulls()
     first_point = np.cumsum([0, *(len(hull.points) for hull in hulls)])
     faces = [(hull.points, face, start) for hull, start in zip(hulls, first_point, strict=False) for face in hull.faces]
-    result.kind, result.first_point = sim.ints(model.shape_type), sim.ints(first_point)
-    result.first_face = sim.ints(np.cumsum([0, *(len(hull.faces) for hull in hulls)]))
+    result.kind = sim.ints([*model.shape_type, *([shapes.PIECE] * len(centres))])
+    result.first_point, result.first_face = sim.ints(first_point), sim.ints(np.cumsum([0, *(len(hull.faces) for hull in hulls)]))
     result.point = sim._constant(np.concatenate([hull.points for hull in hulls]), vec3)
     result.normal = sim._constant(np.array([face_normal(points, face) for points, face, _ in faces]).reshape(-1, 3), vec3)
     result.first_corner = sim.ints(np.cumsum([0, *(len(face) for _, face, _ in faces)]))
     result.corner = sim.ints([start + k for _, face, start in faces for k in face])
-    return result
+    seams = np.zeros(len(faces), dtype=np.int32)
+    seams[len(faces) - 2 * len(centres) :] = np.concatenate([_seams(s) for s in model.shape_hull if isinstance(s, Mesh)] or [[]])
+    result.seam = sim.ints(seams)
+    result.mesh = wp.array([tree.id if tree else 0 for tree in trees], dtype=wp.uint64, device=sim.device)
+    result.first_piece = sim.ints(np.cumsum([0, *map(len, pieces)]))
+    result.centre = sim._constant(centres, vec3)
+    result.radius = sim._constant(np.array([np.linalg.norm(hull.points, axis=1).max() for hull in hulls[model.num_shapes :]]), sim.real)
+    return result, [tree for tree in trees if tree]
+
+
+def _seams(mesh: Mesh) -> np.ndarray:
+    """[2 T] bits of the sides beyond which a triangle goes on in another one, in the same plane: of its front, then of its back."""
+    p = mesh.points[mesh.triangles]
+    normals = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    at: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    _, same = np.unique(mesh.points, axis=0, return_inverse=True)  # files repeat points where faces meet
+    for t, corners in enumerate(same.reshape(-1)[mesh.triangles].tolist()):
+        for k in range(3):
+            a, b = corners[k], corners[(k + 1) % 3]
+            at.setdefault((min(a, b), max(a, b)), []).append((t, k))
+    front, back = np.zeros(len(p), dtype=np.int32), np.zeros(len(p), dtype=np.int32)
+    for sides in at.values():
+        if len(sides) == 2 and abs(normals[sides[0][0]] @ normals[sides[1][0]]) > 1.0 - 0.5 * SEAM**2 and _across(p, sides):
+            for t, k in sides:
+                front[t] |= 1 << k
+                back[t] |= 1 << (1 - k) % 3  # the back has corners 2, 1, 0
+    return np.stack([front, back], axis=1).reshape(-1)
+
+
+def _across(p: np.ndarray, sides: list[tuple[int, int]]) -> bool:
+    """Are two triangles on either side of the side that they share, not folded onto each other?"""
+    (a, i), (b, j) = sides
+    e = p[a, (i + 1) % 3] - p[a, i]
+    off_a, off_b = p[a, (i + 2) % 3] - p[a, i], p[b, (j + 2) % 3] - p[a, i]
+    return bool(np.cross(e, off_a) @ np.cross(e, off_b) < 0.0)
+
+
+def _tree(mesh: Mesh, device: Any) -> wp.Mesh:
+    """Warp's tree of bounds; it is in single precision, so the ball that is looked for is a little larger."""
+    return wp.Mesh(
+        points=wp.array(mesh.points.astype(np.float32), dtype=wp.vec3, device=device),
+        indices=wp.array(mesh.triangles.ravel(), dtype=int, device=device),
+    )
 
 
 def face_normal(points: np.ndarray, face: tuple[int, ...]) -> np.ndarray:

@@ -40,7 +40,7 @@ import warp as wp
 from .errors import MissingExtra, WarpLcpError, whole_number
 from .hulls import face_normal
 from .kernels.watch import collect_status
-from .model import Hull, JointType, Model, ShapeType
+from .model import Hull, JointType, Mesh, Model, ShapeType
 from .simulator import INFORMATIVE, Simulator, Status
 
 #: Environments logged unless asked for otherwise: disk and viewer, not the simulator, set this limit.
@@ -302,9 +302,11 @@ class RerunLogger:
             vertices, triangles, light = ball(half[0])
             colors = np.where(light[:, None], np.array(color), np.array(color) * 0.55).astype(np.uint8)
             return rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_normals=vertices / half[0], vertex_colors=colors)
-        if kind in (ShapeType.CONE, ShapeType.HULL):
-            hull = self.sim.model.shape_hull[shape] or cone_hull(*half[:2])
-            vertices, normals, triangles = flat_faces(hull)
+        if kind in (ShapeType.CONE, ShapeType.HULL, ShapeType.MESH):
+            solid = self.sim.model.shape_hull[shape] or cone_hull(*half[:2])
+            if isinstance(solid, Mesh):
+                solid = Hull(solid.points, tuple(map(tuple, solid.triangles.tolist())))
+            vertices, normals, triangles = flat_faces(solid)
             return rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_normals=normals, albedo_factor=color)
         clear = kind in (ShapeType.BOX, ShapeType.CAPSULE, ShapeType.CYLINDER) and shape in self._moving  # the forces on it start inside
         mode = rr.components.FillMode.TransparentFillMajorWireframe if clear else rr.components.FillMode.Solid

@@ -79,6 +79,7 @@ class ShapeType(enum.IntEnum):
     CYLINDER = 4
     CONE = 5
     HULL = 6
+    MESH = 7
 
 
 #: Shapes whose pairs are looked at with ``shapes.Hulls``.
@@ -101,6 +102,9 @@ CONTACT_POINTS: dict[tuple[ShapeType, ShapeType], int] = {
     **{(ShapeType.SPHERE, kind): 1 for kind in CONVEX},
     **{(ShapeType.CAPSULE, kind): 3 for kind in CONVEX},
     **{(a, b): 8 for b in CONVEX for a in (ShapeType.BOX, *CONVEX) if a <= b},
+    (ShapeType.SPHERE, ShapeType.MESH): 8,
+    (ShapeType.CAPSULE, ShapeType.MESH): 12,
+    **{(kind, ShapeType.MESH): 24 for kind in (ShapeType.BOX, *CONVEX)},
 }
 
 #: Contact parameters of Table 1 for a body of 1 kg; an unauthored parameter is this times the mass of the lighter
@@ -179,6 +183,14 @@ class Hull:
     faces: tuple[tuple[int, ...], ...]
 
 
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in their shape's frame: points [V, 3] m, triangles [T, 3] of them."""
+
+    points: np.ndarray
+    triangles: np.ndarray
+
+
 def parents_first(parent: list[int]) -> list[int]:
     """Bodies in their own order but for children that come before their parents, which wait for them."""
     children: dict[int, list[int]] = {}
@@ -244,8 +256,9 @@ class Model:
         shape_pose: [S, 7] pose in the owner's frame.
         shape_size: [S, 3] metres; box: half extents, sphere: radius in [0], capsule: radius in [0], half the length of its
             straight part, which lies along local z, in [1]; cylinder: radius, half length along z; cone: radius of its base at
-            z = -half, half height; hull: half extents of its bounds, whose centre the frame is in; plane: unused (normal = local +z).
-        shape_hull: [S] :class:`Hull` of each hull, None for other shapes.
+            z = -half, half height; hull and mesh: half extents of its bounds, whose centre the frame is in; plane: unused
+            (normal = local +z).
+        shape_hull: [S] :class:`Hull` of each hull, :class:`Mesh` of each mesh, None for other shapes.
         shape_surface_velocity: [S, 3] m/s in the shape's frame, velocity of the surface relative to the body (belts).
         friction: [S, 2] static and dynamic coefficient.
         contact: [S, 5] k_n, b_n, k_t, b_t, v_s; NaN where the defaults of Table 1 apply.
@@ -282,7 +295,7 @@ class Model:
     shape_body: np.ndarray
     shape_pose: np.ndarray
     shape_size: np.ndarray
-    shape_hull: tuple[Hull | None, ...]
+    shape_hull: tuple[Hull | Mesh | None, ...]
     shape_surface_velocity: np.ndarray
     friction: np.ndarray
     contact: np.ndarray
@@ -356,7 +369,8 @@ class Model:
         points = []
         for a, b in self.pairs:
             hull = self.shape_hull[b]
-            points.append(CONTACT_POINTS[ShapeType(self.shape_type[a]), ShapeType(self.shape_type[b])] or (len(hull.points) if hull else 0))
+            most = CONTACT_POINTS[ShapeType(self.shape_type[a]), ShapeType(self.shape_type[b])]
+            points.append(most or (len(hull.points) if hull else 0))
         return np.concatenate([[0], np.cumsum(points, dtype=np.int64)]).astype(np.int32)
 
     @property

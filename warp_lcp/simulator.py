@@ -16,7 +16,22 @@ import warp as wp
 
 from . import articulation, hulls
 from .errors import SimulationError, WarpLcpError, positive_number, whole_number
-from .kernels import bodies, box_box, capsule, certify, collide, contacts, convex, integrate, joint_rows, reset, restitution, rounded, tree
+from .kernels import (
+    bodies,
+    box_box,
+    capsule,
+    certify,
+    collide,
+    contacts,
+    convex,
+    integrate,
+    joint_rows,
+    mesh,
+    reset,
+    restitution,
+    rounded,
+    tree,
+)
 from .kernels.types import scalar_types
 from .laws import Law
 from .methods import METHODS, chosen
@@ -575,7 +590,8 @@ class Simulator:
         self.doubtful: wp.array = wp.empty(doubtful, dtype=int, device=self.device)
         self.num_doubtful: wp.array = wp.zeros(1, dtype=int, device=self.device)
         pair_kernels = list(dict.fromkeys(kernel for kernel, *_ in self._pair_kernels))
-        self.hulls = hulls.arrays(self.model, self) if any(with_hulls for *_, with_hulls in self._pair_kernels) else None
+        if any(with_hulls for *_, with_hulls in self._pair_kernels):
+            self.hulls, self._meshes = hulls.arrays(self.model, self)  # the latter so that they live as long
         self.kernels: list[Any] = []
         self._load([*(m.kernel for m in reversed(self._methods)), *pair_kernels, *vars(self._kernels).values()])  # long ones first
 
@@ -621,8 +637,10 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     kinds = [tuple(ShapeType(model.shape_type[s]).name for s in pair) for pair in model.pairs]
     pairs = []
     for kind in dict.fromkeys(kinds):
-        with_hulls = ShapeType[kind[1]] in CONVEX
-        if with_hulls and kind[0] in ("SPHERE", "CAPSULE"):
+        with_hulls = ShapeType[kind[1]] in (*CONVEX, ShapeType.MESH)
+        if kind[1] == "MESH":
+            kernel = mesh.make(real).round_on_mesh if kind[0] in ("SPHERE", "CAPSULE") else mesh.make(real).sharp_on_mesh
+        elif with_hulls and kind[0] in ("SPHERE", "CAPSULE"):
             kernel = rounded.make(real)
         elif with_hulls:
             kernel = convex.make(real).on_plane if kind[0] == "PLANE" else convex.make(real).sharp
