@@ -232,17 +232,31 @@ def test_unusable_mass_is_refused_by_name(content, inner, what):
     assert what in message
 
 
-def test_total_mass_of_shapes_that_are_not_simulated_yet():
+TETRAHEDRON = """point3f[] points = [(0,0,0),(1,0,0),(0,1,0),(0,0,1)]; int[] faceVertexCounts = [3, 3, 3, 3];
+    int[] faceVertexIndices = [0,2,1, 0,1,3, 0,3,2, 1,2,3];"""
+
+
+def test_mass_of_cylinders_cones_and_meshes():
     shapes = {
         "Cylinder": ("double radius = 0.5; double height = 2;", math.pi * 0.25 * 2),
         "Cone": ("double radius = 0.5; double height = 2;", math.pi * 0.25 * 2 / 3),
     }
     for kind, (content, volume) in shapes.items():
-        reading = read(body(inner=prim(kind, "C", (COLLIDER,), content)))
-        assert reading.mass == pytest.approx(1000 * volume, rel=1e-5)
-        assert [i.path for i in reading.report.unsupported] == ["/B/C"]
-    mesh = "point3f[] points = [(0,0,0),(1,0,0),(0,1,0)]; int[] faceVertexCounts = [3]; int[] faceVertexIndices = [0,1,2];"
-    assert read(body(inner=prim("Mesh", "C", (COLLIDER,), mesh))).mass is None
+        model = load(body(inner=prim(kind, "C", (COLLIDER,), content)))
+        assert model.mass == pytest.approx([1000 * volume], rel=1e-6)
+        assert model.com[0] == pytest.approx([0, 0, -0.5 if kind == "Cone" else 0])
+    hull = 'uniform token physics:approximation = "convexHull";'
+    model = load(body(inner=prim("Mesh", "C", (COLLIDER, "PhysicsMeshCollisionAPI"), TETRAHEDRON + hull)))
+    assert model.mass == pytest.approx([1000 / 6], rel=1e-6)
+    assert model.com[0] == pytest.approx([0.25, 0.25, 0.25])
+    # Corners at 0 and on the axes: integral of x^2 is 1/60, of x y 1/120.
+    about_corner = 1000 * (np.diag([1 / 30] * 3) - (np.ones((3, 3)) - np.eye(3)) / 120)
+    expected = about_corner - 1000 / 6 * (3 / 16 * np.eye(3) - np.full((3, 3), 1 / 16))
+    assert model.inertia[0] == pytest.approx(expected, rel=1e-6)
+    flat = "point3f[] points = [(0,0,0),(1,0,0),(0,1,0)]; int[] faceVertexCounts = [3]; int[] faceVertexIndices = [0,1,2];"
+    reading = read(body(inner=prim("Mesh", "C", (COLLIDER,), flat)))
+    assert reading.mass is None
+    assert [i.path for i in reading.report.unsupported] == ["/B/C"]
 
 
 # -- poses ----------------------------------------------------------------------------------------------------------
@@ -530,12 +544,12 @@ def test_unknown_joint_type_collider_on_xform_and_bare_articulation_root():
 
 
 def test_unsupported_shapes_are_all_named():
-    others = [prim(kind, kind, (COLLIDER,)) for kind in ("Cylinder", "Cone", "Mesh", "Capsule_1")]
+    others = [prim(kind, kind, (COLLIDER,)) for kind in ("Mesh", "Capsule_1")]
     plane = body("Flying", inner=prim("Plane", "P", (COLLIDER,)) + cube())
     off = prim("Cone", "Off", (COLLIDER,), "bool physics:collisionEnabled = 0;")
     message = refused(plane, *others, off)
     assert "Plane collider /Flying/P: a plane is infinite" in message
-    for kind in ("Cylinder", "Cone", "Mesh", "Capsule_1"):
+    for kind in ("Mesh", "Capsule_1"):
         assert f"{kind} collider /{kind}" in message
     assert "/Off" not in message
 

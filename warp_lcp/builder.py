@@ -493,6 +493,12 @@ class ModelBuilder:
             "loops": tuple(joints.loop_of(joint) for joint in loops),
         }
 
+    @property
+    def welded(self) -> set[int]:
+        """Bodies that a fixed joint holds."""
+        fixed = [joint for joint in self._joints if joint.type is JointType.FIXED and not joint.loop]
+        return {body for joint in fixed for body in (joint.parent, joint.child)}
+
     def _mass_properties(self, index: int) -> tuple[float, np.ndarray, np.ndarray]:
         body = self._bodies[index]
         parts = []
@@ -503,6 +509,8 @@ class ModelBuilder:
                 parts.append((m, s.pose[:3] + rot @ centre, m * rot @ inertia @ rot.T))
         if parts:
             mass, com, inertia = compose_mass(parts)
+        elif body.mass is None and index in self.welded:
+            mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
         elif body.joint is JointType.FREE:
             if body.mass is None or body.inertia is None:
                 raise ModelError(f"{body.name}: mass is unknown, the body has no shape; give it mass and inertia, or a shape")

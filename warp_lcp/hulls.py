@@ -135,9 +135,8 @@ def arrays(model: Model, sim: Any) -> tuple[Any, list[wp.Mesh]]:
     result.normal = sim._constant(np.array([face_normal(points, face) for points, face, _ in faces]).reshape(-1, 3), vec3)
     result.first_corner = sim.ints(np.cumsum([0, *(len(face) for _, face, _ in faces)]))
     result.corner = sim.ints([start + k for _, face, start in faces for k in face])
-    seams = np.zeros(len(faces), dtype=np.int32)
-    seams[len(faces) - 2 * len(centres) :] = np.concatenate([_seams(s) for s in model.shape_hull if isinstance(s, Mesh)] or [[]])
-    result.seam = sim.ints(seams)
+    seams = [_seams(shape) for shape in model.shape_hull if isinstance(shape, Mesh)]
+    result.seam = sim.ints(np.concatenate([np.zeros(len(faces) - 2 * len(centres)), *seams]))
     result.mesh = wp.array([tree.id if tree else 0 for tree in trees], dtype=wp.uint64, device=sim.device)
     result.first_piece = sim.ints(np.cumsum([0, *map(len, pieces)]))
     result.centre = sim._constant(centres, vec3)

@@ -35,13 +35,17 @@ from typing import Any
 
 import numpy as np
 
+from . import hulls
 from .builder import ModelBuilder, capsule_solid, rotation_matrix
 from .errors import MissingExtra, ModelError, SceneError
-from .model import Ignored, JointType, Material, Model, Report
+from .model import Ignored, JointType, Material, Model, Report, ShapeType
 from .usd_attributes import CONTACT_ATTRIBUTES, SURFACE_VELOCITY, unread
 from .usd_joints import JointReader
+from .usd_shapes import Solid, mesh_solid, round_solid
 
 _UNIFORM = 1e-4  # relative: scales closer than this are equal, axes closer than this are perpendicular
+_COLLIDERS = ("PlaneShape", "CubeShape", "SphereShape", "CapsuleShape", "CylinderShape", "ConeShape", "MeshShape")
+_SHAPES = "Plane, Cube, Sphere, Capsule, Cylinder, Cone or Mesh"
 _LISTED = 100  # unsupported prims that an error lists by path; the report always has all
 
 
@@ -269,7 +273,9 @@ class _Reader:
         self.bodies: dict[Any, _Body] = {}
         self.shapes: list[_Shape] = []
         self.masses: list[float | None] = []
+        self.massless: list[Any] = []
         self.unbound: list[str] = []
+        self.solids: dict[Any, Solid] = {}
         self.all_joints: set[Any] = set()
 
     # -- the whole --------------------------------------------------------------------------------------------------
@@ -291,6 +297,7 @@ class _Reader:
         for path, desc in active:
             self._shape(path, desc)
         joints = JointReader(self).read()
+        self._massless()
         self._filter()
         self._other_prims()
         if self.unbound:
@@ -399,7 +406,7 @@ class _Reader:
                 options["joint"] = JointType.KINEMATIC
             else:
                 mass = self._mass(path, frame)
-                self.masses.append(mass["mass"])
+                self.masses.append(0.0 if path in self.massless else mass["mass"])
                 options.update(mass)
             index = self.builder.add_body(str(path), **options)
         except (_Unusable, ModelError) as error:
@@ -407,6 +414,15 @@ class _Reader:
             self.masses.append(None)
         else:
             self.bodies[path] = _Body(path, frame, index)
+
+    def _massless(self) -> None:
+        """Bodies without mass: only what a fixed joint holds needs none."""
+        for path in self.massless:
+            if path in self.bodies and self.bodies[path].index not in self.builder.welded:
+                why = "its mass is zero: neither physics:mass nor an enabled collider gives it any; author one of them"
+                self.unsupported.append(Ignored(str(path), "rigid body", why))
+            elif path in self.bodies:
+                self.notes.append(f"{path}: no mass: neither physics:mass nor an enabled collider gives it any; a fixed joint holds it")
 
     def _animated(self, path: Any) -> bool:
         prim = self.stage.GetPrimAtPath(path)
@@ -433,7 +449,8 @@ class _Reader:
         authored = self._authored_mass(prim)
         mass = authored["mass"] or found
         if not unknown and not mass > 0.0:
-            raise _Unusable("its mass is zero: neither physics:mass nor an enabled collider gives it any; author one of them")
+            self.massless.append(path)
+            return {"mass": None}
         if not own and authored["diagonal"] is None:
             self.notes.append(f"{path}: no collider and no physics:diagonalInertia: the inertia of a sphere of 0.1 m radius, as in USD")
         elif authored["zero"]:
@@ -496,11 +513,10 @@ class _Reader:
         solid = self._solid(prim, self.colliders.get(prim.GetPath()), frame)
         if solid is None:
             unknown.append(prim.GetPath())
-            solid = (1.0, np.ones(3), np.zeros(3))
-        volume, gyration, centre = solid
+            solid = (1.0, np.eye(3), np.zeros(3))
+        volume, inertia, centre = solid
         info.volume = float(volume)
-        info.inertia = Gf.Matrix3f(1.0)
-        info.inertia.SetDiagonal(Gf.Vec3f(*(volume * gyration).tolist()))
+        info.inertia = Gf.Matrix3f(*(volume * inertia).ravel().tolist())
         info.centerOfMass = Gf.Vec3f(*centre.tolist())
         info.localPos = Gf.Vec3f(*(body.rotation.T @ (frame.position - body.position)).tolist())
         x, y, z, w = self._quaternion(body.rotation.T @ frame.rotation)
@@ -508,18 +524,21 @@ class _Reader:
         return info
 
     def _solid(self, prim: Any, desc: Any, frame: _Frame) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """(volume, principal inertia per unit mass about the centre, centre) in the collider's frame; None = unknown."""
+        """(volume, inertia [3, 3] per unit mass about the centre, centre) in the collider's frame; None = unknown."""
         kind = "" if desc is None else str(desc.type).rpartition(".")[2]
         if kind == "CubeShape":
             half = self._half_extents(prim, frame)
-            return 8.0 * float(np.prod(half)), (half @ half - half**2) / 3.0, np.zeros(3)
+            return 8.0 * float(np.prod(half)), np.diag(half @ half - half**2) / 3.0, np.zeros(3)
         if kind == "SphereShape":
             radius = self._radius(prim) * frame.scale.max()
-            return 4.0 / 3.0 * math.pi * radius**3, np.full(3, 0.4 * radius**2), np.zeros(3)
+            return 4.0 / 3.0 * math.pi * radius**3, 0.4 * radius**2 * np.eye(3), np.zeros(3)
+        if kind == "MeshShape":
+            return self._mesh_mass(prim, desc, frame)
         if kind not in ("CapsuleShape", "CylinderShape", "ConeShape"):
             return None
-        r, h, centre = float(desc.radius), float(desc.halfHeight), np.zeros(3)  # h: half the height of the straight part
-        axis = "XYZ".index(str(desc.axis).rpartition(".")[2])
+        centre, axis = np.zeros(3), "XYZ".index(str(desc.axis).rpartition(".")[2])
+        # h: half the height, of a capsule that of its straight part.
+        r, h = self._capsule(prim, frame) if kind == "CapsuleShape" else round_solid(self.px, prim, kind, frame.scale).size
         if kind == "CapsuleShape":
             volume, along, across = capsule_solid(r, h)
         elif kind == "CylinderShape":
@@ -527,7 +546,22 @@ class _Reader:
         else:
             volume, along, across = 2.0 / 3.0 * math.pi * r**2 * h, 0.3 * r**2, 0.15 * r**2 + 0.15 * h**2
             centre[axis] = -0.5 * h * frame.sign
-        return volume, np.where(np.arange(3) == axis, along, across), centre
+        return volume, np.diag(np.where(np.arange(3) == axis, along, across)), centre
+
+    def _mesh_mass(self, prim: Any, desc: Any, frame: _Frame) -> tuple[float, np.ndarray, np.ndarray] | None:
+        try:
+            solid = self._solid_of(prim, desc, frame)
+        except ModelError:
+            return None  # refused as a shape
+        if solid.hull is not None:
+            volume, centre, inertia = hulls.solid(solid.hull)
+            return volume, inertia, centre
+        if solid.kind is ShapeType.BOX:
+            half = np.array(solid.size)
+            return 8.0 * float(np.prod(half)), np.diag(half @ half - half**2) / 3.0, np.asarray(solid.centre)
+        if solid.kind is ShapeType.SPHERE:
+            return 4.0 / 3.0 * math.pi * solid.size[0] ** 3, 0.4 * solid.size[0] ** 2 * np.eye(3), np.asarray(solid.centre)
+        return None
 
     # -- shapes -----------------------------------------------------------------------------------------------------
 
@@ -558,6 +592,20 @@ class _Reader:
             rotation = np.roll(frame.rotation, 2 - "XYZ".index(str(self.px.UsdGeom.Capsule(prim).GetAxisAttr().Get())), axis=1)
         else:
             rotation = frame.rotation
+        solid = None
+        if kind in ("CylinderShape", "ConeShape", "MeshShape"):
+            try:
+                solid = self._solid_of(prim, desc, frame)
+            except ModelError as error:
+                self.unsupported.append(Ignored(str(path), f"{prim.GetTypeName()} collider", str(error).removeprefix(f"{path}: ")))
+                return
+            self.notes.extend(solid.notes)
+            if solid.kind in (ShapeType.CYLINDER, ShapeType.CONE):
+                rotation = np.roll(frame.rotation, 2 - solid.axis, axis=1)
+                if frame.sign < 0.0:  # a mirrored cone has its tip on the other side
+                    rotation = rotation * [1.0, -1.0, -1.0]
+            elif solid.centre is not None:
+                frame = replace(frame, position=frame.position + frame.rotation @ solid.centre)
         options: dict[str, Any] = {
             "pose": self._pose(frame, None if body is None else body.frame, rotation),
             "name": str(path),
@@ -565,7 +613,9 @@ class _Reader:
             "surface_velocity": self._surface_velocity(prim, frame, rotation),
         }
         try:
-            if kind == "PlaneShape":
+            if solid is not None:
+                shape = self._add_solid(index, solid, options)
+            elif kind == "PlaneShape":
                 shape = self.builder.add_plane(index, **options)
             elif kind == "SphereShape":
                 shape = self.builder.add_sphere(index, self.length * self._radius(prim) * frame.scale.max(), **options)
@@ -579,11 +629,38 @@ class _Reader:
         else:
             self.shapes.append(_Shape(path, desc, owner, shape))
 
+    def _solid_of(self, prim: Any, desc: Any, frame: _Frame) -> Solid:
+        """Of a cylinder, cone or mesh, found once."""
+        path, kind = prim.GetPath(), str(desc.type).rpartition(".")[2]
+        if path not in self.solids:
+            if kind == "MeshShape":
+                owner = self.body_descs.get(desc.rigidBody) if desc.rigidBody else None
+                self.solids[path] = mesh_solid(
+                    self.px, prim, frame.rotation.T @ frame.linear, owner is not None and not owner.kinematicBody
+                )
+            else:
+                self.solids[path] = round_solid(self.px, prim, kind, frame.scale)
+        return self.solids[path]
+
+    def _add_solid(self, body: int, solid: Solid, options: dict[str, Any]) -> int:
+        size = [self.length * x for x in solid.size]
+        if solid.kind is ShapeType.CYLINDER:
+            return self.builder.add_cylinder(body, size[0], size[1], **options)
+        if solid.kind is ShapeType.CONE:
+            return self.builder.add_cone(body, size[0], size[1], **options)
+        if solid.kind is ShapeType.BOX:
+            return self.builder.add_box(body, size, **options)
+        if solid.kind is ShapeType.SPHERE:
+            return self.builder.add_sphere(body, size[0], **options)
+        if solid.hull is not None:
+            return self.builder.add_hull(body, self.length * solid.hull.points, **options)
+        return self.builder.add_mesh(body, self.length * np.asarray(solid.points), solid.triangles, **options)
+
     def _shape_problem(self, prim: Any, desc: Any, frame: _Frame) -> tuple[str, str] | None:
         """(what, why) where a collider cannot be simulated."""
         name, kind = f"{prim.GetTypeName()} collider", str(desc.type).rpartition(".")[2]
-        if kind not in ("CubeShape", "SphereShape", "CapsuleShape", "PlaneShape"):
-            return name, "this shape is not supported yet; use Plane, Sphere, Capsule or Cube, or set physics:collisionEnabled = false"
+        if kind not in _COLLIDERS:
+            return name, f"this shape is not supported; use {_SHAPES}, or set physics:collisionEnabled = false"
         owner = self.body_descs.get(desc.rigidBody) if desc.rigidBody else None
         if kind == "PlaneShape" and owner is not None and not owner.kinematicBody:
             return name, "a plane is infinite and cannot move freely; make it static or its body kinematic"
@@ -591,8 +668,17 @@ class _Reader:
         if kind in ("SphereShape", "CapsuleShape") and stretch[0] - stretch[2] > _UNIFORM * stretch[0]:
             what = "Sphere collider scaled to an ellipsoid" if kind == "SphereShape" else "Capsule collider with ends scaled to ellipsoids"
             return what, "this shape is not supported yet; scale all axes alike"
-        if kind == "CubeShape" and frame.sheared:
-            return "sheared Cube collider", "a rotation under a non-uniform scale slants it; put the scale on the Cube itself"
+        if kind in ("CylinderShape", "ConeShape"):
+            axis = "XYZ".index(str(desc.axis).rpartition(".")[2])
+            one, other = frame.scale[(axis + 1) % 3], frame.scale[(axis + 2) % 3]
+            if abs(one - other) > _UNIFORM * max(one, other):
+                return (
+                    f"{name} scaled to an ellipse",
+                    "this shape is not supported; scale both axes across it alike, or use a Mesh",
+                )
+        if kind in ("CubeShape", "CylinderShape", "ConeShape") and frame.sheared:
+            what = name.removesuffix(" collider")
+            return f"sheared {name}", f"a rotation under a non-uniform scale slants it; put the scale on the {what} itself"
         return None
 
     def _plane_rotation(self, prim: Any, frame: _Frame) -> np.ndarray:
@@ -749,7 +835,7 @@ class _Reader:
         if path in self.colliders or not prim.HasAPI(api) or not api(prim).GetCollisionEnabledAttr().Get():
             return
         if prim.IsA(self.px.UsdGeom.Gprim):
-            why = "UsdPhysics has no collider of this type; use Plane, Sphere, Capsule or Cube"
+            why = f"UsdPhysics has no collider of this type; use {_SHAPES}"
             self.unsupported.append(Ignored(str(path), f"{type_name} collider", why))
         else:
             what = f"PhysicsCollisionAPI on {type_name or 'an untyped prim'}"
