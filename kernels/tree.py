@@ -633,7 +633,7 @@ def make(real) -> SimpleNamespace:
         bias: wp.array2d(dtype=real),
         stride: int,
     ):
-        """M(q), dense, and c(q, v) with what gravity takes from it, after kinematics; `nothing` are zeros, for wrenches are no part of c."""
+        """M(q), dense, and c(q, v) with what gravity takes from it, after kinematics; `nothing` is zero: wrenches are no part of c."""
         start, _ = wp.tid()
         for env in range(start, nothing.shape[0], stride):
             mass_matrix(topology, parameters, trees, bodies, real(0.0), env)

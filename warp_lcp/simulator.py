@@ -166,6 +166,7 @@ class Simulator:
         self.sign_tolerance = 1e-12 if self.real is wp.float64 else 1e-6
         self.rounding = 2.0**-50 if self.real is wp.float64 else 2.0**-21  # what a gap is known to, as a part of a coordinate
         self._types = scalar_types(self.real)
+        self.trees: Any = None  # of a model without joints only once somebody asks for M or c
         self._allocate()
         self._load_kernels()
         self._graphs: dict[str, Any] = {}
@@ -553,7 +554,6 @@ class Simulator:
         self.next_velocity = self._array(b, t.spatial)
         #: What solvers know of the bodies: the bodies themselves, or the trees they hang in.
         self.mechanics: Any = bundle
-        self.trees: Any = None
         self.control: Control | None = None
         if m.articulated:
             trees = self.mechanics = self.trees = articulation.arrays(self, tree.functions(self.real).Trees)
