@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks accuracy|stability|chart|speed|peers|friction|lcp|paper|robust|resources|needs|regression|all [--help]"""
+"""python -m benchmarks accuracy|stability|chart|speed|peers|friction|lcp|paper|dynamics|robust|resources|needs|regression|all [--help]"""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from . import (
     accuracy,
     chart,
     chart_picture,
+    dynamics,
     friction,
     goals,
     lcp,
@@ -96,6 +97,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     sub.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
     sub = command("paper", run_paper, "the paper's own comparison: formulations, lead matrices, Fig. 4", quick)
     sub.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
+    command("dynamics", run_dynamics, "kinematics, mass matrix and bias of robots from USD, beside MuJoCo's", out, quick, place)
     sub = command("robust", run_robust, "randomised environments of every shipped scene: what is certified", out, device)
     sub.add_argument("--scenes", type=lambda text: text.split(","), default=robust.scenes(), metavar="NAME,...", help="default: all")
     sub.add_argument("--formulations", type=lambda text: text.split(","), default=["phantom_inertia", "coulomb"], metavar="NAME,...")
@@ -283,6 +285,17 @@ def run_paper(asked: argparse.Namespace) -> None:
             asked.out.mkdir(parents=True, exist_ok=True)
         paper_picture.draw(data, (asked.out or report.DOCS) / "paper_comparison")
     keep(asked, device, data)
+
+
+def run_dynamics(asked: argparse.Namespace) -> None:
+    try:
+        data = dynamics.measure(asked.quick, asked.dir)
+    except FileNotFoundError as error:
+        raise SystemExit(f"python -m benchmarks: error: {error}") from error
+    print(dynamics.markdown(data))
+    keep(asked, wp.get_device("cpu"), data, not data["absent"])
+    if any(dynamics.problems(row) for row in data["rows"]):
+        raise SystemExit(1)
 
 
 def run_robust(asked: argparse.Namespace) -> None:
