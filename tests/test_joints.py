@@ -601,6 +601,19 @@ def test_joints_that_are_none():
         builder.add_distance(-1, body, 2.0, 1.0)
 
 
+def test_bodies_that_hang_rigidly_on_each_other_do_not_touch():
+    """Two arms welded to one base: none of the three can move towards another, whatever overlaps; a hinge beyond may."""
+    builder = wl.ModelBuilder()
+    base, left, right, hand = (builder.add_body() for _ in range(4))
+    for body in (base, left, right, hand):
+        builder.add_sphere(body, 0.1)
+    builder.add_joint(JointType.FIXED, base, left, collide=True)
+    builder.add_joint(JointType.FIXED, base, right)
+    builder.add_joint(JointType.REVOLUTE, right, hand)
+    model = builder.finalize()
+    assert sorted(model.shape_body[model.pairs].tolist()) == [[base, hand], [left, hand]]
+
+
 def test_scenes_without_joints_compile_no_kernel_of_joints():
     """What a box on the ground compiles has nothing of kernels/tree.py or joint_rows.py."""
     builder = wl.ModelBuilder()

@@ -112,8 +112,8 @@ def test_excluded_joint_closes_a_loop():
 
 def test_joined_bodies_pass_through_each_other_unless_they_collide():
     boxes = [body(n, xform(translate=f"({x}, 0, 0)"), inner=cube(size=0.9)) for n, x in (("A", 0), ("B", 1))]
-    assert len(load(*boxes, joint("Fixed", JOINT)).pairs) == 0
-    assert len(load(*boxes, joint("Fixed", JOINT + "bool physics:collisionEnabled = 1;")).pairs) == 1
+    assert len(load(*boxes, joint("Revolute", JOINT)).pairs) == 0
+    assert len(load(*boxes, joint("Revolute", JOINT + "bool physics:collisionEnabled = 1;")).pairs) == 1
 
 
 def test_what_is_not_simulated_is_named():

@@ -374,7 +374,7 @@ class ModelBuilder:
             up_axis=self.up_axis,
             report=Report() if report is None else report,
         )
-        return replace(model, pairs=self._pairs(model.movable))
+        return replace(model, pairs=self._pairs(model))
 
     def _forest(self, com: np.ndarray) -> dict[str, Any]:
         """Model's fields of bodies, joints and coordinates; coordinates in the order of the tree, parents first."""
@@ -462,7 +462,13 @@ class ModelBuilder:
             mass, inertia = body.mass, inertia * (body.mass / mass)
         return mass, com, inertia if body.inertia is None else body.inertia
 
-    def _pairs(self, moves: np.ndarray) -> np.ndarray:
+    def _pairs(self, model: Model) -> np.ndarray:
+        moves = model.movable
+        welded = np.arange(len(self._bodies) + 1)  # first of the bodies that hang rigidly on each other; they do not touch
+        for b in model.order:
+            if model.joint_type[b] == JointType.FIXED and model.body_parent[b] >= 0:
+                welded[b] = welded[model.body_parent[b]]
+
         def movable(s: _Shape) -> bool:
             return bool(moves[s.body])
 
@@ -471,7 +477,7 @@ class ModelBuilder:
         pairs = []
         for j, b in enumerate(self._shapes):
             for i, a in enumerate(self._shapes[:j]):
-                if a.body == b.body or not (movable(a) or movable(b)) or (i, j) in self._filtered:
+                if welded[a.body] == welded[b.body] or not (movable(a) or movable(b)) or (i, j) in self._filtered:
                     continue
                 if frozenset((a.body, b.body)) in joined:
                     continue
