@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks accuracy|stability|chart|speed|peers|friction|lcp|paper|dynamics|robust|resources|needs|regression|all [--help]"""
+"""python -m benchmarks accuracy|stability|chart|speed|peers|friction|lcp|paper|dynamics|robots|robust|resources|needs|regression|all
+
+--help says what each does.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +31,7 @@ from . import (
     regression,
     report,
     resources,
+    robot_speed,
     robust,
     speed,
     stability,
@@ -98,6 +103,12 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     sub = command("paper", run_paper, "the paper's own comparison: formulations, lead matrices, Fig. 4", quick)
     sub.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
     command("dynamics", run_dynamics, "kinematics, mass matrix and bias of robots from USD, beside MuJoCo's", out, quick, place)
+    sub = command("robots", run_robots, "speed of robots from USD beside other engines, falling and at rest (CPU)", out, quick, place)
+    sub.add_argument("names", nargs="*", metavar="ROBOT", help=f"of {', '.join(robot_speed.FILES)} (default: all)")
+    known = tuple(robot_speed.VARIANTS)
+    sub.add_argument(
+        "--peers", type=partial(peer_names, known=known), default=",".join(known), metavar="all|none|NAME,...", help="default: %(default)s"
+    )
     sub = command("robust", run_robust, "randomised environments of every shipped scene: what is certified", out, device)
     sub.add_argument("--scenes", type=lambda text: text.split(","), default=robust.scenes(), metavar="NAME,...", help="default: all")
     sub.add_argument("--formulations", type=lambda text: text.split(","), default=["phantom_inertia", "coulomb"], metavar="NAME,...")
@@ -296,6 +307,22 @@ def run_dynamics(asked: argparse.Namespace) -> None:
     keep(asked, wp.get_device("cpu"), data, not data["absent"])
     if any(dynamics.problems(row) for row in data["rows"]):
         raise SystemExit(1)
+
+
+def run_robots(asked: argparse.Namespace) -> None:
+    names = asked.names or list(robot_speed.FILES)
+    if unknown := [name for name in names if name not in robot_speed.FILES]:
+        raise SystemExit(f"python -m benchmarks: error: no robot {unknown[0]!r}; choose from {', '.join(robot_speed.FILES)}")
+    present, absent = peers.split(asked.peers, asked.dir)
+    if absent:
+        print(absent)
+    try:
+        data = robot_speed.measure(names, present, asked.quick, asked.dir)
+    except FileNotFoundError as error:
+        raise SystemExit(f"python -m benchmarks: error: {error}") from error
+    print(robot_speed.markdown(data))
+    complete = len(names) == len(robot_speed.FILES) and len(present) == len(robot_speed.VARIANTS) and not data["absent"]
+    keep(asked, wp.get_device("cpu"), data, complete)
 
 
 def run_robust(asked: argparse.Namespace) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -65,12 +66,12 @@ class Robot:
         sim.reset()
         return sim
 
-    @property
+    @cached_property
     def pose(self) -> np.ndarray:
         """[E, B, 7] start of the body frames, x y z qx qy qz qw."""
         return self.simulator(device="cpu").body_pose.numpy().copy()
 
-    @property
+    @cached_property
     def velocity(self) -> np.ndarray:
         """[E, B, 6] start, of the centre of mass, then angular, world axes."""
         return self.simulator(device="cpu").body_velocity.numpy().copy()
@@ -174,17 +175,28 @@ def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def dropped(name: str, path: Path, envs: int, dt: float, steps: int, height: float = 0.1) -> Robot:
-    """A robot in slightly different poses at rest, the lowest point of each so high above the ground [m]."""
+    """A robot in slightly different poses that moves a little, the lowest point of each so high above the ground [m].
+
+    Poses in which bodies overlap are drawn anew: engines part them in ways of their own.
+
+    Raises:
+        ValueError: if nearly all poses overlap.
+    """
     model = load(path)
-    q, _ = random_states(model, envs, seed=0, spread=0.2)
-    robot = Robot(name, model, dt, steps, q, np.zeros((envs, model.nv)))
+    q, v = random_states(model, 8 * envs, seed=0, spread=0.2)
+    robot = Robot(name, model, dt, steps, q, 0.2 * v)
     roots = [b for b in range(model.num_bodies) if model.joint_type[b] == JointType.FREE]
     q[:, model.q_start[roots] + 2] += (height - lowest(model, robot.pose))[:, None]
-    return replace(robot, q=q)
+    sim = replace(robot, v=np.zeros_like(v)).simulator(device="cpu")
+    sim.step()
+    apart = np.flatnonzero(sim.contacts.count.numpy() == 0)[:envs]
+    if len(apart) < envs:
+        raise ValueError(f"{name}: only {len(apart)} of {8 * envs} poses have no contact")
+    return replace(robot, q=q[apart], v=robot.v[apart])
 
 
-def settled(robot: Robot, seconds: float) -> Robot:
+def settled(robot: Robot, name: str, seconds: float) -> Robot:
     """The same after so much time, as we simulate it."""
     sim = robot.simulator(device="cpu")
     sim.step(round(seconds / robot.dt))
-    return replace(robot, q=sim.q.numpy().copy(), v=sim.v.numpy().copy())
+    return replace(robot, name=name, q=sim.q.numpy().copy(), v=sim.v.numpy().copy())

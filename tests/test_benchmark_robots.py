@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_benchmarks import fake, folder  # noqa: F401
 from test_joints import moved, pendulum, poses, quadruped, random_state, random_tree
 
 import warp_lcp as wl
-from benchmarks import dynamics, peers, robots
+from benchmarks import dynamics, peers, robot_speed, robots
+from benchmarks.peers.session import session
 from warp_lcp.model import DofKind, Drive, JointType
 
 sys.path.insert(0, str(Path(peers.__file__).parent / "adapters"))
@@ -154,7 +156,7 @@ def test_a_dropped_robot_starts_above_the_ground(tmp_path, monkeypatch):
     made = robots.dropped("quadruped", tmp_path, 4, 2e-3, 10, height=0.05)
     assert robots.lowest(model, made.pose) == pytest.approx(np.full(4, 0.05), abs=1e-12)
     assert np.ptp(made.q[:, 7:], axis=0).min() > 0.0
-    later = robots.settled(made, 1.0)
+    later = robots.settled(made, "later", 1.0)
     assert np.abs(robots.lowest(model, later.pose)).max() < 1e-3
 
 
@@ -197,3 +199,65 @@ def test_robots_of_others_agree_with_mujoco(shared, name):
     if name in data["absent"]:
         pytest.skip(data["absent"][name][:100])
     assert dynamics.problems(data["rows"][0]) == []
+
+
+# ------------------------------------------------------------------------------------------------------------------ speed
+
+
+def standing() -> robots.Robot:
+    """A quadruped on its feet, under its drives."""
+    model = quadruped().finalize()
+    return robots.Robot("quadruped", model, 2e-3, 20, np.tile(model.q0, (3, 1)), np.zeros((3, model.nv)))
+
+
+@pytest.mark.parametrize(
+    ("fault", "problem"), [(None, []), ("start", ["another start pose"]), ("overflow", ["contacts or rows overflowed"])]
+)
+def test_turns_with_a_robot(folder, monkeypatch, fault, problem):  # noqa: F811
+    """The peer gets the bodies of the robot; ours is told with its residuals, and both by how they end."""
+    monkeypatch.setitem(robot_speed.VARIANTS, "fake", ("plain",))
+    with session(fake(folder, **({} if fault is None else {"fault": fault})), folder) as running:
+        mine, theirs = robot_speed.one(standing(), [running], 3)
+    assert (len(mine["seconds"]), len(theirs["seconds"])) == (3, 3)
+    assert mine["certified"] == 1.0
+    assert 0.0 < mine["residual_max"] < 1e-6
+    assert mine["contacts"] == 8.0  # four feet, and thighs that graze the base at two points
+    assert mine["base_moved"] < 0.01
+    assert mine["torn"] < 1e-12
+    assert theirs["problems"] == problem
+    assert theirs["contacts"] == 4.0
+    text = robot_speed.markdown({"rows": [mine, theirs], "absent": {"x": "x: cannot be simulated"}})
+    assert ("NOT COMPARED" in text) == bool(problem)
+    assert "100.00% certified" in text
+    assert "left out: x: cannot" in text
+
+
+def test_what_is_said_of_another_motion():
+    same = {"penetration": 1e-5, "torn": 1e-12, "base": 0.5}
+    assert robot_speed.remarks(same, same) == []
+    other = {"penetration": 5e-3, "torn": 4e-3, "base": 0.4}
+    assert robot_speed.remarks(same, other) == ["5 mm in the ground", "joints torn by 4 mm", "base at 0.40 m, ours 0.50 m"]
+
+
+@pytest.mark.parametrize(
+    ("name", "variant"),
+    [
+        ("mujoco", "elliptic"),
+        pytest.param("mujoco_warp", "pyramidal", marks=pytest.mark.slow),
+        pytest.param("newton_xpbd", "2 iterations", marks=pytest.mark.slow),
+        pytest.param("newton_steel", "12 sweeps", marks=pytest.mark.slow),
+    ],
+)
+def test_a_robot_falls_alike_in_other_engines(shared, name, variant):
+    """They start where we do, and after 20 ms of free fall the base is where ours is, to 0.1 mm."""
+    peer = peers.PEERS[name]
+    if not peer.installed(peers.FOLDER):
+        pytest.skip("the peer's interpreter is not installed")
+    falling = robots.dropped("go1", shared / "usd" / robot_speed.FILES["go1"], 2, 2e-3, 10)
+    end, _ = robot_speed.record(falling.simulator(device="cpu"), falling)
+    with session(peer, peers.FOLDER) as running:
+        task = running.make(variant, falling, falling.steps)
+        task.repeat()
+    assert robot_speed.compare.problems(falling, task) == []
+    assert np.abs(task.pose[-1] - end.pose)[:, 0, :3].max() < 1e-4
+    assert robots.torn(falling.model, task.pose[-1]) < 1e-4
