@@ -35,10 +35,10 @@ FILES = {
     "humanoid": "newton/ex_humanoid.usda",
     "go1": "converted/go1/go1.usda",
 }
-#: Variants of each peer: contacts as they come and round cones; XPBD from its default upwards.
+#: Variants of each peer: contacts as they come, round cones, and the stiffest that it allows; XPBD from its default upwards.
 VARIANTS = {
-    "mujoco": ("pyramidal", "elliptic"),
-    "mujoco_warp": ("pyramidal", "elliptic"),
+    "mujoco": ("pyramidal", "elliptic", "elliptic, stiff"),
+    "mujoco_warp": ("pyramidal", "elliptic", "elliptic, stiff"),
     "newton_xpbd": ("2 iterations", "10 iterations", "20 iterations"),
     "newton_steel": ("12 sweeps",),
 }
@@ -61,7 +61,7 @@ class End:
             "contacts": self.contacts,
             "base": float(base[:, 2].mean()),
             "base_moved": float(np.linalg.norm(base - robot.pose[:, 0, :3], axis=-1).mean()),
-            "penetration": max(0.0, -float(robots.lowest(robot.model, self.pose).min())),
+            "penetration": float(np.maximum(0.0, -robots.lowest(robot.model, self.pose).min())),
             "torn": robots.torn(robot.model, self.pose),
         }
 

@@ -164,7 +164,7 @@ def torn(model: wl.Model, pose: np.ndarray) -> float:
         if (parent := model.body_parent[b]) >= 0:
             anchor = pose[..., parent, :3] + rotate(pose[..., parent, 3:], anchor)
         own = pose[..., b, :3] + rotate(pose[..., b, 3:], model.joint_child_pose[b, :3])
-        worst = max(worst, float(np.linalg.norm(anchor - own, axis=-1).max()))
+        worst = float(np.maximum(worst, np.linalg.norm(anchor - own, axis=-1).max()))  # NaN stays one
     return worst
 
 
