@@ -21,6 +21,22 @@ def axes(real) -> SimpleNamespace:
     """Separating-axis tests of box b in the frame of box a: d = centre of b, R = axes of b as columns."""
     t = scalar_types(real)
     vec3, mat33 = t.vec3, t.mat33
+    Bodies, Topology = t.Bodies, t.Topology
+
+    @wp.func
+    def inverse_mass(topology: Topology, bodies: Bodies, env: int, shape: int) -> real:
+        body = topology.shape_body[shape]
+        result = real(0.0)
+        if body >= 0:
+            result = bodies.inv_mass[env, body]
+        return result
+
+    @wp.func
+    def touching_depth(gravity: vec3, inverse_a: real, inverse_b: real, stiffness: real) -> vec3:
+        """How deep shapes may overlap that count as touching: what their load presses them in, m, no less than the first and no more
+        than the last of these parts of the smallest half extent."""
+        load = wp.length(gravity) / wp.max(wp.max(inverse_a, inverse_b), real(1.0e-30))
+        return vec3(real(TOUCHING), real(ELASTIC_RANGE) * load / stiffness, real(SUNK))
 
     @wp.func
     def face_separation(d: vec3, rotation: mat33, ha: vec3, hb: vec3, axis: int) -> real:
@@ -63,7 +79,15 @@ def axes(real) -> SimpleNamespace:
             return ahead - far
         return ahead
 
-    return SimpleNamespace(face_separation=face_separation, edge_axis=edge_axis, edge_separation=edge_separation, column=column, rank=rank)
+    return SimpleNamespace(
+        face_separation=face_separation,
+        edge_axis=edge_axis,
+        edge_separation=edge_separation,
+        column=column,
+        rank=rank,
+        inverse_mass=inverse_mass,
+        touching_depth=touching_depth,
+    )
 
 
 @functools.cache
@@ -141,6 +165,7 @@ def make(real):
     shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
     far_apart, set_apart = f.far_apart, f.set_apart
     face_separation, edge_axis, edge_separation, column, rank = a.face_separation, a.edge_axis, a.edge_separation, a.column, a.rank
+    inverse_mass, touching_depth = a.inverse_mass, a.touching_depth
     Polygon, clip = p.Polygon, p.clip
 
     @wp.func
@@ -329,14 +354,6 @@ def make(real):
         write(slots, env, slot, wp.transform_point(face, p), sign * wp.transform_vector(face, outward), z, feature)
         return 1
 
-    @wp.func
-    def inverse_mass(topology: Topology, bodies: Bodies, env: int, shape: int) -> real:
-        body = topology.shape_body[shape]
-        result = real(0.0)
-        if body >= 0:
-            result = bodies.inv_mass[env, body]
-        return result
-
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def box_box(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
         start, index = wp.tid()
@@ -377,11 +394,10 @@ def make(real):
                 bias = real(1.0e-3) * smallest
                 inverse_a = inverse_mass(topology, bodies, env, sa)
                 inverse_b = inverse_mass(topology, bodies, env, sb)
-                load = wp.length(parameters.gravity[env % parameters.gravity.shape[0]]) / wp.max(
-                    wp.max(inverse_a, inverse_b), real(1.0e-30)
-                )
+                gravity = parameters.gravity[env % parameters.gravity.shape[0]]
                 stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
-                touching = wp.clamp(real(ELASTIC_RANGE) * load / stiffness, real(TOUCHING) * smallest, real(SUNK) * smallest)
+                depth = touching_depth(gravity, inverse_a, inverse_b, stiffness)
+                touching = wp.clamp(depth[1], depth[0] * smallest, depth[2] * smallest)
                 far = real(2.0) * apart
                 best = real(-2.0) * far
                 axis = int(0)

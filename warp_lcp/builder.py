@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from . import joints
+from . import hulls, joints
 from .errors import ModelError, positive_number
 from .joints import AXES, Joint
-from .model import CONTACT_POINTS, JOINT_AXES, DofKind, Drive, JointType, Material, Model, Report, ShapeType
+from .model import CONTACT_POINTS, JOINT_AXES, DofKind, Drive, Hull, JointType, Material, Model, Report, ShapeType
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 NO_LIMIT, NO_DRIVE = (-np.inf, np.inf), (0.0, 0.0, np.inf, 0.0, 0.0)
@@ -54,23 +54,26 @@ class _Shape:
     material: Material
     density: float
     surface_velocity: np.ndarray
+    hull: Hull | None
 
-    def volume(self) -> float:
-        if self.type is ShapeType.BOX:
-            return 8.0 * float(np.prod(self.size))
-        if self.type is ShapeType.CAPSULE:
-            return capsule_solid(*self.size[:2])[0]
-        return 4.0 / 3.0 * np.pi * float(self.size[0]) ** 3
-
-    def unit_inertia(self) -> np.ndarray:
-        """Inertia [3, 3] per unit mass about the shape's own centre, in the shape's axes."""
+    def solid(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """Volume, centre of mass [3] and inertia [3, 3] per unit mass about it, in the shape's frame."""
+        centre, (r, h) = np.zeros(3), self.size[:2]
+        if self.hull is not None:
+            return hulls.solid(self.hull)
         if self.type is ShapeType.BOX:
             s = self.size**2
-            return np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) / 3.0
+            return 8.0 * float(np.prod(self.size)), centre, np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) / 3.0
+        if self.type is ShapeType.SPHERE:
+            return 4.0 / 3.0 * np.pi * r**3, centre, np.eye(3) * 0.4 * r**2
         if self.type is ShapeType.CAPSULE:
-            _, along, across = capsule_solid(*self.size[:2])
-            return np.diag([across, across, along])
-        return np.eye(3) * 0.4 * self.size[0] ** 2
+            volume, along, across = capsule_solid(r, h)
+        elif self.type is ShapeType.CYLINDER:
+            volume, along, across = 2.0 * np.pi * r**2 * h, r**2 / 2.0, r**2 / 4.0 + h**2 / 3.0
+        else:
+            volume, along, across = 2.0 / 3.0 * np.pi * r**2 * h, 0.3 * r**2, 0.15 * (r**2 + h**2)
+            centre = np.array([0.0, 0.0, -0.5 * h])
+        return volume, centre, np.diag([across, across, along])
 
 
 def capsule_solid(r: float, h: float) -> tuple[float, float, float]:
@@ -287,6 +290,34 @@ class ModelBuilder:
         size = [_positive("capsule: radius", radius, "m"), _positive("capsule: half length", half_length, "m"), 0.0]
         return self._add_shape(ShapeType.CAPSULE, body, pose, np.array(size), **options)
 
+    def add_cylinder(self, body: int, radius: float, half_length: float, *, pose: Sequence[float] = IDENTITY, **options) -> int:
+        """Add a cylinder along the shape's z axis; arguments as for :meth:`add_capsule`, half_length is half of all of it."""
+        size = [_positive("cylinder: radius", radius, "m"), _positive("cylinder: half length", half_length, "m"), 0.0]
+        return self._add_shape(ShapeType.CYLINDER, body, pose, np.array(size), **options)
+
+    def add_cone(self, body: int, radius: float, half_height: float, *, pose: Sequence[float] = IDENTITY, **options) -> int:
+        """Add a cone with its base at z = -half_height and its tip at z = half_height; ``options`` as for :meth:`add_box`."""
+        size = [_positive("cone: radius", radius, "m"), _positive("cone: half height", half_height, "m"), 0.0]
+        return self._add_shape(ShapeType.CONE, body, pose, np.array(size), **options)
+
+    def add_hull(self, body: int, points: Any, *, pose: Sequence[float] = IDENTITY, **options) -> int:
+        """Add the convex hull of points; ``options`` as for :meth:`add_box`. Returns the shape's index.
+
+        Args:
+            body: owner; -1 = world.
+            points: [N, 3] m, in the frame of ``pose``. A hull has 64 corners at most: of more those that change it most are kept.
+            pose: in the owner's frame. The frame of the shape itself is in the middle of the hull's bounds.
+
+        Raises:
+            ModelError: for points that span no volume.
+            MissingExtra: no scipy is installed (the extra 'mesh').
+        """
+        hull, _ = hulls.convex_hull(options.get("name") or f"shape{len(self._shapes)}", points)
+        low, high = hull.points.min(axis=0), hull.points.max(axis=0)
+        pose = joints.compose(_pose("hull", pose), np.r_[0.5 * (low + high), 0.0, 0.0, 0.0, 1.0])
+        hull = Hull(hull.points - 0.5 * (low + high), hull.faces)
+        return self._add_shape(ShapeType.HULL, body, pose, 0.5 * (high - low), hull=hull, **options)
+
     def add_box(
         self,
         body: int,
@@ -327,6 +358,7 @@ class ModelBuilder:
         material: Material | None = None,
         density: float = 1000.0,
         surface_velocity: Sequence[float] = (0.0, 0.0, 0.0),
+        hull: Hull | None = None,
     ) -> int:
         name = f"shape{len(self._shapes)}" if name is None else name
         if not -1 <= body < len(self._bodies):
@@ -337,7 +369,7 @@ class ModelBuilder:
         _check_material(name, material)
         _positive(f"{name}: density", density, "kg/m^3")
         velocity = _vector(f"{name}: surface velocity", surface_velocity, 3)
-        self._shapes.append(_Shape(name, kind, body, _pose(name, pose), size, material, float(density), velocity))
+        self._shapes.append(_Shape(name, kind, body, _pose(name, pose), size, material, float(density), velocity, hull))
         return len(self._shapes) - 1
 
     def filter_pair(self, shape_a: int, shape_b: int) -> None:
@@ -365,6 +397,7 @@ class ModelBuilder:
             shape_body=np.array([s.body for s in shapes], dtype=np.int32),
             shape_pose=np.array([s.pose for s in shapes], dtype=float).reshape(-1, 7),
             shape_size=np.array([s.size for s in shapes], dtype=float).reshape(-1, 3),
+            shape_hull=tuple(s.hull for s in shapes),
             shape_surface_velocity=np.array([s.surface_velocity for s in shapes], dtype=float).reshape(-1, 3),
             friction=np.array([(s.material.static_friction, s.material.dynamic_friction) for s in shapes], dtype=float).reshape(-1, 2),
             contact=np.array([[getattr(s.material, f) for f in CONTACT_FIELDS] for s in shapes], dtype=float).reshape(-1, 5),
@@ -444,8 +477,9 @@ class ModelBuilder:
         parts = []
         for s in self._shapes:
             if s.body == index and s.type is not ShapeType.PLANE:
-                m, rot = s.density * s.volume(), rotation_matrix(s.pose[3:])
-                parts.append((m, s.pose[:3], m * rot @ s.unit_inertia() @ rot.T))
+                (volume, centre, inertia), rot = s.solid(), rotation_matrix(s.pose[3:])
+                m = s.density * volume
+                parts.append((m, s.pose[:3] + rot @ centre, m * rot @ inertia @ rot.T))
         if parts:
             mass, com, inertia = compose_mass(parts)
         elif body.joint is JointType.FREE:

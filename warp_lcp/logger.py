@@ -38,8 +38,9 @@ import numpy as np
 import warp as wp
 
 from .errors import MissingExtra, WarpLcpError, whole_number
+from .hulls import face_normal
 from .kernels.watch import collect_status
-from .model import JointType, Model, ShapeType
+from .model import Hull, JointType, Model, ShapeType
 from .simulator import INFORMATIVE, Simulator, Status
 
 #: Environments logged unless asked for otherwise: disk and viewer, not the simulator, set this limit.
@@ -301,11 +302,17 @@ class RerunLogger:
             vertices, triangles, light = ball(half[0])
             colors = np.where(light[:, None], np.array(color), np.array(color) * 0.55).astype(np.uint8)
             return rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_normals=vertices / half[0], vertex_colors=colors)
-        clear = kind in (ShapeType.BOX, ShapeType.CAPSULE) and shape in self._moving  # the forces on it start inside
+        if kind in (ShapeType.CONE, ShapeType.HULL):
+            hull = self.sim.model.shape_hull[shape] or cone_hull(*half[:2])
+            vertices, normals, triangles = flat_faces(hull)
+            return rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_normals=normals, albedo_factor=color)
+        clear = kind in (ShapeType.BOX, ShapeType.CAPSULE, ShapeType.CYLINDER) and shape in self._moving  # the forces on it start inside
         mode = rr.components.FillMode.TransparentFillMajorWireframe if clear else rr.components.FillMode.Solid
         if kind == ShapeType.CAPSULE:  # Rerun's own start at z = 0
             at = [(0.0, 0.0, -half[1])]
             return rr.Capsules3D(lengths=[2.0 * half[1]], radii=[half[0]], translations=at, colors=[color], fill_mode=mode)
+        if kind == ShapeType.CYLINDER:
+            return rr.Cylinders3D(lengths=[2.0 * half[1]], radii=[half[0]], colors=[color], fill_mode=mode)
         return rr.Boxes3D(half_sizes=[half], colors=[color], fill_mode=mode)
 
     def _open(self, sink: str | os.PathLike[str]) -> str:
@@ -456,9 +463,11 @@ def lay_out(model: Model, pose: np.ndarray, velocity: np.ndarray, moving: Sequen
     where = shape_poses(model, pose, model.shape_pose, shapes)
     half, turns = model.shape_size[shapes], np.isin(shapes, moving)
     around = np.linalg.norm(half, axis=-1)  # radius of the bounding sphere: a sphere has its radius alone there
-    long = model.shape_type[shapes] == ShapeType.CAPSULE
-    around = np.where(long, half[:, 0] + half[:, 1], around)
-    half = np.where(long[:, None], np.stack([half[:, 0], half[:, 0], around], axis=-1), half)
+    kind = model.shape_type[shapes]
+    around = np.where(kind == ShapeType.CAPSULE, half[:, 0] + half[:, 1], around)
+    long = np.where(kind == ShapeType.CAPSULE, around, half[:, 1])
+    turned = np.isin(kind, (ShapeType.CAPSULE, ShapeType.CYLINDER, ShapeType.CONE))  # radius, half length -> half extents
+    half = np.where(turned[:, None], np.stack([half[:, 0], half[:, 0], long], axis=-1), half)
     size = 2.0 * float(np.median(around[turns])) if turns.any() else 1.0
     axes = np.stack([rotate(where[..., 3:], half[:, i, None] * np.eye(3)[i]) for i in range(3)])
     whole = turns | (model.shape_type[shapes] == ShapeType.SPHERE)
@@ -520,6 +529,22 @@ def ball(radius: float, rings: int = 12) -> tuple[np.ndarray, np.ndarray, np.nda
     vertices = np.concatenate([octant * s for s in signs])
     triangles = np.concatenate([(faces if e else faces[:, ::-1]) + k * len(octant) for k, e in enumerate(even)])
     return vertices, triangles, np.repeat(even, len(octant))
+
+
+def cone_hull(radius: float, half: float, sides: int = 48) -> Hull:
+    """A cone as it is drawn."""
+    angle = 2.0 * np.pi * np.arange(sides) / sides
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides, -half)], axis=1)
+    side = [(k, (k + 1) % sides, sides) for k in range(sides)]
+    return Hull(np.vstack([ring, [[0.0, 0.0, half]]]), (*side, tuple(range(sides))[::-1]))
+
+
+def flat_faces(hull: Hull) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A hull as a mesh whose faces are seen to be flat: vertices and normals, those of each face its own, and triangles."""
+    first = np.cumsum([0, *(len(face) for face in hull.faces)])
+    triangles = [(a, a + k, a + k + 1) for face, a in zip(hull.faces, first, strict=False) for k in range(1, len(face) - 1)]
+    normals = [np.tile(face_normal(hull.points, face), (len(face), 1)) for face in hull.faces]
+    return hull.points[[k for face in hull.faces for k in face]], np.vstack(normals), np.array(triangles)
 
 
 def _eye(layout: Layout, up: int) -> tuple[np.ndarray, np.ndarray]:

@@ -76,9 +76,15 @@ class ShapeType(enum.IntEnum):
     SPHERE = 1
     BOX = 2
     CAPSULE = 3
+    CYLINDER = 4
+    CONE = 5
+    HULL = 6
 
 
-#: Contact points that a pair of shapes can make, by (lower type, higher type); pairs not listed never touch.
+#: Shapes whose pairs are looked at with ``shapes.Hulls``.
+CONVEX = (ShapeType.CYLINDER, ShapeType.CONE, ShapeType.HULL)
+#: Contact points that a pair of shapes can make, by (lower type, higher type), a hull on a plane 0: one for each of its points.
+#: Pairs not listed never touch.
 CONTACT_POINTS: dict[tuple[ShapeType, ShapeType], int] = {
     (ShapeType.PLANE, ShapeType.SPHERE): 1,
     (ShapeType.PLANE, ShapeType.BOX): 8,
@@ -89,6 +95,12 @@ CONTACT_POINTS: dict[tuple[ShapeType, ShapeType], int] = {
     (ShapeType.SPHERE, ShapeType.CAPSULE): 1,
     (ShapeType.BOX, ShapeType.CAPSULE): 3,
     (ShapeType.CAPSULE, ShapeType.CAPSULE): 3,
+    (ShapeType.PLANE, ShapeType.CYLINDER): 12,
+    (ShapeType.PLANE, ShapeType.CONE): 7,
+    (ShapeType.PLANE, ShapeType.HULL): 0,
+    **{(ShapeType.SPHERE, kind): 1 for kind in CONVEX},
+    **{(ShapeType.CAPSULE, kind): 3 for kind in CONVEX},
+    **{(a, b): 8 for b in CONVEX for a in (ShapeType.BOX, *CONVEX) if a <= b},
 }
 
 #: Contact parameters of Table 1 for a body of 1 kg; an unauthored parameter is this times the mass of the lighter
@@ -159,6 +171,14 @@ class Loop:
     distance: tuple[float, float] | None = None
 
 
+@dataclass(frozen=True)
+class Hull:
+    """A convex polyhedron in its shape's frame: points [V, 3] m, and faces, the corners of each counterclockwise from outside."""
+
+    points: np.ndarray
+    faces: tuple[tuple[int, ...], ...]
+
+
 def parents_first(parent: list[int]) -> list[int]:
     """Bodies in their own order but for children that come before their parents, which wait for them."""
     children: dict[int, list[int]] = {}
@@ -223,7 +243,9 @@ class Model:
         shape_names, shape_type, shape_body: [S] name, :class:`ShapeType` and owner (-1 = world).
         shape_pose: [S, 7] pose in the owner's frame.
         shape_size: [S, 3] metres; box: half extents, sphere: radius in [0], capsule: radius in [0], half the length of its
-            straight part, which lies along local z, in [1]; plane: unused (normal = local +z).
+            straight part, which lies along local z, in [1]; cylinder: radius, half length along z; cone: radius of its base at
+            z = -half, half height; hull: half extents of its bounds, whose centre the frame is in; plane: unused (normal = local +z).
+        shape_hull: [S] :class:`Hull` of each hull, None for other shapes.
         shape_surface_velocity: [S, 3] m/s in the shape's frame, velocity of the surface relative to the body (belts).
         friction: [S, 2] static and dynamic coefficient.
         contact: [S, 5] k_n, b_n, k_t, b_t, v_s; NaN where the defaults of Table 1 apply.
@@ -260,6 +282,7 @@ class Model:
     shape_body: np.ndarray
     shape_pose: np.ndarray
     shape_size: np.ndarray
+    shape_hull: tuple[Hull | None, ...]
     shape_surface_velocity: np.ndarray
     friction: np.ndarray
     contact: np.ndarray
@@ -330,7 +353,10 @@ class Model:
     @property
     def pair_slots(self) -> np.ndarray:
         """[P + 1] offsets: pair p owns the contact slots pair_slots[p] ... pair_slots[p + 1] - 1."""
-        points = [CONTACT_POINTS[ShapeType(self.shape_type[a]), ShapeType(self.shape_type[b])] for a, b in self.pairs]
+        points = []
+        for a, b in self.pairs:
+            hull = self.shape_hull[b]
+            points.append(CONTACT_POINTS[ShapeType(self.shape_type[a]), ShapeType(self.shape_type[b])] or (len(hull.points) if hull else 0))
         return np.concatenate([[0], np.cumsum(points, dtype=np.int64)]).astype(np.int32)
 
     @property

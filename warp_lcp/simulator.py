@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from . import articulation
+from . import articulation, hulls
 from .errors import SimulationError, WarpLcpError, positive_number, whole_number
-from .kernels import bodies, box_box, capsule, certify, collide, contacts, integrate, joint_rows, reset, restitution, tree
+from .kernels import bodies, box_box, capsule, certify, collide, contacts, convex, integrate, joint_rows, reset, restitution, rounded, tree
 from .kernels.types import scalar_types
 from .laws import Law
 from .methods import METHODS, chosen
-from .model import Model, ShapeType
+from .model import CONVEX, Model, ShapeType
 from .rollout import Recorder, Rollout
 
 INTEGRATORS = ("euler", "midpoint")
@@ -414,8 +414,9 @@ class Simulator:
             self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
         if self.model.bounded:
             self.launch(k.bounds, [self.topology, self.bodies, h], len(self.model.shape_body))
-        for kernel, first, number in self._pair_kernels:
-            self.launch(kernel, [*scene, self.bodies, first, h, self.slots], number)
+        for kernel, first, number, with_hulls in self._pair_kernels:
+            more = [self.hulls] if with_hulls else []
+            self.launch(kernel, [*scene, self.bodies, first, h, self.slots, *more], number)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
         if not self._methods[0].makes_rows:
@@ -604,7 +605,8 @@ class Simulator:
         self.queued: wp.array = wp.zeros(left, dtype=int, device=self.device)
         self.doubtful: wp.array = wp.empty(doubtful, dtype=int, device=self.device)
         self.num_doubtful: wp.array = wp.zeros(1, dtype=int, device=self.device)
-        pair_kernels = [kernel for kernel, *_ in self._pair_kernels]
+        pair_kernels = list(dict.fromkeys(kernel for kernel, *_ in self._pair_kernels))
+        self.hulls = hulls.arrays(self.model, self) if any(with_hulls for *_, with_hulls in self._pair_kernels) else None
         self.kernels: list[Any] = []
         self._load([*(m.kernel for m in reversed(self._methods)), *pair_kernels, *vars(self._kernels).values()])  # long ones first
 
@@ -620,8 +622,8 @@ class Simulator:
                 done.result()
 
 
-def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, int]]]:
-    """Kernels of the stages by name, and (kernel, first pair, number of pairs) for each kind of pair in the model."""
+def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, int, bool]]]:
+    """Kernels of the stages by name, and (kernel, first pair, number of pairs, does it take hulls?) for each kind of pair in the model."""
     rows, motion = contacts.make(real, model.articulated), integrate.make(real)
     body = tree.make(real) if model.articulated else bodies.make(real)
     stages = SimpleNamespace(
@@ -650,9 +652,16 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     kinds = [tuple(ShapeType(model.shape_type[s]).name for s in pair) for pair in model.pairs]
     pairs = []
     for kind in dict.fromkeys(kinds):
-        by_kind = capsule.make(real) if "CAPSULE" in kind else collide.make(real)
-        kernel = box_box.make(real) if kind == ("BOX", "BOX") else by_kind[kind]
-        pairs.append((kernel, kinds.index(kind), kinds.count(kind)))
+        with_hulls = ShapeType[kind[1]] in CONVEX
+        if with_hulls and kind[0] in ("SPHERE", "CAPSULE"):
+            kernel = rounded.make(real)
+        elif with_hulls:
+            kernel = convex.make(real).on_plane if kind[0] == "PLANE" else convex.make(real).sharp
+        elif kind == ("BOX", "BOX"):
+            kernel = box_box.make(real)
+        else:
+            kernel = (capsule.make(real) if "CAPSULE" in kind else collide.make(real))[kind]
+        pairs.append((kernel, kinds.index(kind), kinds.count(kind), with_hulls))
     return stages, pairs
 
 
@@ -664,7 +673,7 @@ def kernel_names(
     methods = [kind(model, real, law) for kind in chosen(method, precision, law)]
     stages, pairs = stage_kernels(model, real, integrator, methods[0].makes_rows)
     solvers = [kind.kernel for kind in methods]
-    return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *(k for k, *_ in pairs), *solvers)]
+    return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *dict.fromkeys(k for k, *_ in pairs), *solvers)]
 
 
 def _choice(what: str, value: str, choices: tuple[str, ...]) -> None:

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Convex hulls: of points (by Qhull, in scipy), their mass, and the arrays that kernels read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .errors import MissingExtra, ModelError
+from .model import Hull, Model, ShapeType
+
+#: Points that a hull may have; of more, those are left out that change it least.
+MAX_POINTS = 64
+#: Of the size: corners of a face lie in its plane to within this, and what is thinner is flat.
+FLAT = 1e-9
+#: A box from -1 to 1: its corners, and its faces counterclockwise from outside.
+CORNERS = np.array([[x, y, z] for z in (-1.0, 1.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
+BOX_FACES = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6))
+
+
+def convex_hull(name: str, points: Any) -> tuple[Hull, float]:
+    """The hull of points [N, 3] with :data:`MAX_POINTS` corners at most, and how far it falls short of the whole hull [m].
+
+    Raises:
+        ModelError: for points that are not finite, too few, or in one plane.
+        MissingExtra: no scipy is installed.
+    """
+    try:
+        from scipy.spatial import ConvexHull, QhullError
+    except ImportError as error:
+        raise MissingExtra("convex hulls", "mesh", error) from error
+    points = np.asarray(points, dtype=float)
+    if points.ndim != 2 or points.shape[1:] != (3,) or not np.isfinite(points).all():
+        raise ModelError(f"{name}: points have shape {points.shape}; give [N, 3] finite numbers")
+    size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    try:
+        whole = ConvexHull(points)
+    except (QhullError, ValueError) as error:
+        raise ModelError(f"{name}: {len(points)} points span no volume; a hull needs four that are not in one plane") from error
+    if whole.volume < FLAT * size**3:
+        raise ModelError(f"{name}: its points lie in one plane; a hull needs a volume, give a thin box instead")
+    hull, short = whole, 0.0
+    if len(whole.vertices) > MAX_POINTS:
+        corners = points[whole.vertices]
+        chosen = sorted({int(f(corners[:, k])) for k in range(3) for f in (np.argmin, np.argmax)})
+        chosen += [k for k in np.linspace(0, len(corners) - 1, 8).astype(int).tolist() if k not in chosen]
+        while len(chosen) < MAX_POINTS:
+            hull = ConvexHull(corners[chosen])
+            beyond = (corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1)
+            chosen.append(int(beyond.argmax()))
+        points = corners[chosen]
+        hull = ConvexHull(points)
+        short = float((corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max())
+    place = np.full(len(points), -1)
+    place[hull.vertices] = np.arange(len(hull.vertices))
+    return Hull(points[hull.vertices], tuple(_faces(points, hull, place, size))), short
+
+
+def _faces(points: np.ndarray, hull: Any, place: np.ndarray, size: float) -> list[tuple[int, ...]]:
+    """Triangles in one plane are one face: its corners counterclockwise from outside, in the hull's own numbers."""
+    left, faces = np.ones(len(hull.simplices), dtype=bool), []
+    for k, (*n, c) in enumerate(hull.equations):
+        if not left[k]:
+            continue
+        same = left & (np.abs(points[hull.simplices] @ n + c).max(axis=1) <= 1e3 * FLAT * size) & (hull.equations[:, :3] @ n > 0.0)
+        left &= ~same
+        corners = np.unique(hull.simplices[same])
+        spread = points[corners] - points[corners].mean(axis=0)
+        x = spread[np.argmax((spread**2).sum(axis=1))]
+        faces.append(tuple(place[corners[np.argsort(np.arctan2(spread @ np.cross(n, x), spread @ x))]].tolist()))
+    return faces
+
+
+def solid(hull: Hull) -> tuple[float, np.ndarray, np.ndarray]:
+    """Volume, centre of mass and inertia [3, 3] per unit mass about it, by tetrahedra from one of its points."""
+    triangles = [(face[0], face[k], face[k + 1]) for face in hull.faces for k in range(1, len(face) - 1)]
+    origin = hull.points.mean(axis=0)
+    p = hull.points[np.array(triangles)] - origin  # [T, 3, 3]
+    volumes = np.linalg.det(p) / 6.0
+    volume = float(volumes.sum())
+    total = p.sum(axis=1)
+    centre = (volumes[:, None] * total).sum(axis=0) / (4.0 * volume)
+    # Integral of x x^T over a tetrahedron with one corner at the origin: V / 20 (sum of p p^T over corners + s s^T).
+    second = np.einsum("t,tij,tik->jk", volumes, p, p) + np.einsum("t,tj,tk->jk", volumes, total, total)
+    second = second / (20.0 * volume) - np.outer(centre, centre)
+    return volume, origin + centre, np.trace(second) * np.eye(3) - second
+
+
+def arrays(model: Model, sim: Any) -> Any:
+    """``shapes.Hulls`` of a Simulator: of the shapes in pairs with cylinders, cones and hulls, boxes as hulls."""
+    from .kernels import shapes
+
+    vec3, empty = sim._types.vec3, Hull(np.zeros((0, 3)), ())
+    hulls = []
+    for kind, size, hull in zip(model.shape_type, model.shape_size, model.shape_hull, strict=True):
+        hulls.append(Hull(CORNERS * size, BOX_FACES) if kind == ShapeType.BOX else hull or empty)
+    result = shapes.functions(sim.real).Hulls()
+    first_point = np.cumsum([0, *(len(hull.points) for hull in hulls)])
+    faces = [(hull.points, face, start) for hull, start in zip(hulls, first_point, strict=False) for face in hull.faces]
+    result.kind, result.first_point = sim.ints(model.shape_type), sim.ints(first_point)
+    result.first_face = sim.ints(np.cumsum([0, *(len(hull.faces) for hull in hulls)]))
+    result.point = sim._constant(np.concatenate([hull.points for hull in hulls]), vec3)
+    result.normal = sim._constant(np.array([face_normal(points, face) for points, face, _ in faces]).reshape(-1, 3), vec3)
+    result.first_corner = sim.ints(np.cumsum([0, *(len(face) for _, face, _ in faces)]))
+    result.corner = sim.ints([start + k for _, face, start in faces for k in face])
+    return result
+
+
+def face_normal(points: np.ndarray, face: tuple[int, ...]) -> np.ndarray:
+    """Outward unit normal [3]: of all its corners together, so that a short side spoils none."""
+    corners = points[list(face)] - points[list(face)].mean(axis=0)
+    n = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
+    return n / np.linalg.norm(n)
