@@ -108,7 +108,8 @@ def load(path: Path) -> wl.Model:
 
 
 def random_states(model: wl.Model, envs: int, seed: int, spread: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
-    """q [E, nq], v [E, nv]: angles and ways at random within their limits, or within `spread` of the model's start; v of order one.
+    """q [E, nq], v [E, nv]: angles and ways at random within their limits (anywhere, where these leave one value), or within
+    `spread` of the model's start; v of order one.
 
     Free bodies are turned at random, by about `spread` where that is finite, and stand within a metre of where the model has them.
     """
@@ -127,6 +128,8 @@ def random_states(model: wl.Model, envs: int, seed: int, spread: float = np.inf)
             continue
         for k, i in enumerate(np.flatnonzero(model.dof_body == b)):
             low, high = np.clip(model.limit[i], -np.pi, np.pi)
+            if low == high and np.isinf(spread):  # held where it is, which M and c do not ask
+                low, high = -np.pi, np.pi
             start = np.clip(model.q0[at + k], low, high)
             q[:, at + k] = rng.uniform(max(low, start - spread), min(high, start + spread), envs)
     assert not (model.dof_kind == DofKind.PRESCRIBED).any(), "robots have no kinematic bodies"
@@ -147,6 +150,8 @@ def lowest(model: wl.Model, pose: np.ndarray) -> np.ndarray:
             reach = (np.abs(up) * size).sum(axis=-1)
         elif name == "CYLINDER":
             reach = np.abs(up[..., 2]) * size[1] + np.sqrt(np.maximum(1.0 - up[..., 2] ** 2, 0.0)) * size[0]
+        elif name not in ("SPHERE", "CAPSULE"):
+            raise ValueError(f"how low a {name} reaches is not known here")
         else:  # a sphere has no straight part
             reach = np.abs(up[..., 2]) * size[1] + size[0]
         heights.append(centre[..., 2] - reach)

@@ -91,6 +91,7 @@ def test_what_mjcf_cannot_say_is_refused(tmp_path):
     assert 'damping="2.5"' in text
     assert 'stiffness="3.0" springref="0.1"' in text
     assert 'range="-1.0 2.0"' in text
+    assert 'range="0.499999999 0.500000001"' in mjcf.model(job(robot(made(limit=(0.5, 0.5))), tmp_path))
     # All shapes of two bodies touch or none: the thigh of a leg passes through nothing but its own shank.
     model = quadruped().finalize()
     with pytest.raises(protocol.Refused, match="limited force"):
@@ -148,6 +149,8 @@ def test_random_states_respect_limits():
     near, _ = robots.random_states(model, 50, seed=0, spread=0.1)
     assert np.abs(near[:, 7:] - model.q0[7:]).max() <= 0.1
     assert v.shape == (50, model.nv)
+    held = replace(model, limit=np.zeros_like(model.limit))
+    assert robots.random_states(held, 50, seed=0)[0][:, 7:].std(axis=0).min() > 1.0
 
 
 def test_a_dropped_robot_starts_above_the_ground(tmp_path, monkeypatch):

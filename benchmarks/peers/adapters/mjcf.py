@@ -109,7 +109,8 @@ def joints(tree: Tree | None, body: int) -> str:
             values |= {"stiffness": stiffness, "springref": target}
             found += f'axis="{numbers(rotate(frame[3:], tree.dof_axis[i]))}" '
             if np.isfinite(tree.limit[i]).any():
-                found += f'limited="true" range="{numbers(np.clip(tree.limit[i], -1e9, 1e9))}" '
+                ends = np.clip(tree.limit[i], -1e9, 1e9) + (tree.limit[i, 0] == tree.limit[i, 1]) * np.array([-1e-9, 1e-9])
+                found += f'limited="true" range="{numbers(ends)}" '  # of some width: MuJoCo takes no other
         found += " ".join(f'{name}="{float(value)!r}"' for name, value in values.items()) + "/>"
     return found
 

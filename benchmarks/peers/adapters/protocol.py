@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 
 State = tuple[np.ndarray, np.ndarray]
+KINDS = ("plane", "box", "sphere", "capsule", "cylinder")
 SHAPES = ("shape_kind", "shape_body", "shape_size", "shape_pose")
 BODIES = ("mass", "inertia", "pose", "velocity", "gravity", "wrench")
 
@@ -92,6 +93,10 @@ class Job:
     gravity: np.ndarray
     wrench: np.ndarray
     tree: Tree | None = None
+
+    def __post_init__(self) -> None:
+        if unknown := set(self.shape_kind) - set(KINDS):
+            raise Refused(f"adapters write {', '.join(KINDS)}, and there is a {sorted(unknown)[0]}")
 
     @property
     def envs(self) -> int:
