@@ -42,7 +42,7 @@ from .cases import CASES, case_names
 from .peers import compare
 
 #: What `all` does, in this order; together they make every number and picture of README and docs.
-EVERYTHING = ("speed", "accuracy", "stability", "chart", "friction", "lcp", "paper", "robust", "resources", "needs")
+EVERYTHING = ("speed", "accuracy", "stability", "chart", "friction", "lcp", "paper", "dynamics", "robots", "robust", "resources", "needs")
 
 
 def peer_names(text: str, known: Collection[str] = tuple(peers.PEERS)) -> list[str]:
@@ -117,7 +117,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     command("resources", run_resources, "what the kernels take of a GPU", out)
     command("needs", run_needs, "what each scene takes and uses, and what features elsewhere cost it (CPU)", out, quick)
     sub = command("regression", run_regression, "what got worse since the result that was kept last; status 1 if anything did")
-    sub.add_argument("new", type=Path, help="JSON file of accuracy, stability, chart, peers or speed")
+    sub.add_argument("new", type=Path, help="JSON file of accuracy, stability, chart, peers, robots or speed")
     sub.add_argument("old", type=Path, nargs="?", help="what to compare with (default: the one kept last in benchmarks/results)")
     command("all", run_all, f"one after the other: {', '.join(EVERYTHING)}; some hours", quick)
     others = commands.add_parser("peers", help="other engines on the same scenes").add_subparsers(dest="action", required=True)

@@ -93,7 +93,7 @@ def remarks(mine: dict[str, Any], other: dict[str, Any]) -> list[str]:
 
 
 def one(robot: Robot, sessions: list[Session], repetitions: int) -> Iterator[dict[str, Any]]:
-    """Ours and every variant of every peer with one robot."""
+    """Ours and every variant of every peer with one robot; a line with 'refused' for each that cannot have it."""
     sim = robot.simulator(device="cpu")
     end, worth = record(sim, robot)
     tasks: list[Task] = []
@@ -130,7 +130,8 @@ def measure(names: list[str], others: list[Peer], quick: bool, folder: Path, usd
     """
     if not usd.is_dir():
         raise FileNotFoundError(f"no robots: {usd} does not exist")
-    rows, absent = [], {}
+    rows: list[dict[str, Any]] = []
+    absent: dict[str, str] = {}
     envs, repetitions = (4, 2) if quick else (ENVS, 7)
     with compare.one_core(), ExitStack() as stack:
         sessions = [stack.enter_context(session(peer, folder)) for peer in others]
@@ -143,7 +144,8 @@ def measure(names: list[str], others: list[Peer], quick: bool, folder: Path, usd
             resting = replace(robots.settled(falling, f"{name} at rest", REST), steps=STEPS["at rest"] // (10 if quick else 1))
             for robot in (falling, resting):
                 rows += one(robot, sessions, repetitions)
-    return {"rows": rows, "absent": absent}
+    refused = [row for row in rows if "refused" in row]
+    return {"peers": [row for row in rows if "refused" not in row], "refused": refused, "absent": absent}
 
 
 def markdown(data: dict[str, Any]) -> str:
@@ -152,10 +154,7 @@ def markdown(data: dict[str, Any]) -> str:
         "| robot | engine | env-steps/s | ours / it (least to most) | contacts | base mm | moved mm | in ground mm | torn mm | remarks |",
         "|" + " --- |" * 10,
     ]
-    for r in data["rows"]:
-        if "refused" in r:
-            lines.append(f"| {r['scene']} | {r['engine']} |" + " - |" * 7 + f" REFUSED: {r['refused']} |")
-            continue
+    for r in data["peers"]:
         low, high = r["ours_over_peer_range"]
         ratio = "-" if r["problems"] or r["engine"] == compare.OURS else f"{r['ours_over_peer']:.2f} ({low:.2f} to {high:.2f})"
         lengths = " | ".join(f"{1e3 * r[key]:.3g}" for key in ("base", "base_moved", "penetration", "torn"))
@@ -166,4 +165,5 @@ def markdown(data: dict[str, Any]) -> str:
             f"| {r['scene']}, {r['envs']} envs | {r['engine']} | {r['env_steps_per_s']:,.0f} ± {50 * r['spread']:.0f} % "
             f"| {ratio} | {r['contacts']:.1f} | {lengths} | {'; '.join(said)} |"
         )
+    lines += [f"\n{r['scene']}: refused by {r['refused']}" for r in data["refused"]]
     return "\n".join(lines + [f"\nleft out: {why[:200]}" for why in data["absent"].values()])

@@ -11,7 +11,7 @@ from test_benchmarks import fake, folder  # noqa: F401
 from test_joints import moved, pendulum, poses, quadruped, random_state, random_tree
 
 import warp_lcp as wl
-from benchmarks import dynamics, peers, robot_speed, robots
+from benchmarks import dynamics, peers, regression, robot_speed, robots
 from benchmarks.peers.session import session
 from warp_lcp.model import DofKind, Drive, JointType
 
@@ -213,6 +213,19 @@ def standing() -> robots.Robot:
     return robots.Robot("quadruped", model, 2e-3, 20, np.tile(model.q0, (3, 1)), np.zeros((3, model.nv)))
 
 
+def test_a_peer_that_refuses_a_robot(folder, monkeypatch):  # noqa: F811
+    """It is told, and the others are measured; that a later result is worse is seen as for scenes of boxes."""
+    monkeypatch.setitem(robot_speed.VARIANTS, "fake", ("plain",))
+    with session(fake(folder, fault="refuses"), folder) as running:
+        refused, mine = robot_speed.one(standing(), [running], 2)
+    assert refused["refused"] == "fake, plain: no such thing"
+    data = {"peers": [mine], "refused": [refused], "absent": {}}
+    assert "quadruped: refused by fake, plain: no such thing" in robot_speed.markdown(data)
+    slower = mine | {"engine": "x", "ours_over_peer": 0.5, "ours_over_peer_range": [0.4, 0.6]}
+    faster = slower | {"ours_over_peer": 1.0, "ours_over_peer_range": [0.9, 1.1]}
+    assert len(regression.worse({"what": "robots", "peers": [faster]}, {"what": "robots", "peers": [slower]})) == 1
+
+
 @pytest.mark.parametrize(
     ("fault", "problem"), [(None, []), ("start", ["another start pose"]), ("overflow", ["contacts or rows overflowed"])]
 )
@@ -229,7 +242,7 @@ def test_turns_with_a_robot(folder, monkeypatch, fault, problem):  # noqa: F811
     assert mine["torn"] < 1e-12
     assert theirs["problems"] == problem
     assert theirs["contacts"] == 4.0
-    text = robot_speed.markdown({"rows": [mine, theirs], "absent": {"x": "x: cannot be simulated"}})
+    text = robot_speed.markdown({"peers": [mine, theirs], "refused": [], "absent": {"x": "x: cannot be simulated"}})
     assert ("NOT COMPARED" in text) == bool(problem)
     assert "100.00% certified" in text
     assert "left out: x: cannot" in text
