@@ -601,17 +601,25 @@ def test_joints_that_are_none():
         builder.add_distance(-1, body, 2.0, 1.0)
 
 
-def test_bodies_that_hang_rigidly_on_each_other_do_not_touch():
-    """Two arms welded to one base: none of the three can move towards another, whatever overlaps; a hinge beyond may."""
-    builder = wl.ModelBuilder()
-    base, left, right, hand = (builder.add_body() for _ in range(4))
-    for body in (base, left, right, hand):
-        builder.add_sphere(body, 0.1)
-    builder.add_joint(JointType.FIXED, base, left, collide=True)
-    builder.add_joint(JointType.FIXED, base, right)
-    builder.add_joint(JointType.REVOLUTE, right, hand)
-    model = builder.finalize()
-    assert sorted(model.shape_body[model.pairs].tolist()) == [[base, hand], [left, hand]]
+def test_bodies_that_hang_rigidly_on_each_other_are_as_one_body_to_touch():
+    """Two arms welded to a base touch neither it nor each other; a hand on a hinge of one of them passes through all three,
+    fingers beyond it do not. Where the base is fixed in the world, the hand touches what it is not joined to itself."""
+
+    def pairs(joint: JointType, collide: bool = False) -> list[list[int]]:
+        builder = wl.ModelBuilder()
+        for kind in (joint, *(JointType.FREE,) * 4):
+            builder.add_sphere(builder.add_body(joint=kind), 0.1)
+        builder.add_joint(JointType.FIXED, 0, 1, collide=True)
+        builder.add_joint(JointType.FIXED, 0, 2)
+        builder.add_joint(JointType.REVOLUTE, 2, 3, collide=collide)
+        builder.add_joint(JointType.REVOLUTE, 3, 4)
+        model = builder.finalize()
+        return sorted(sorted(pair) for pair in model.shape_body[model.pairs].tolist())
+
+    fingers = [[0, 4], [1, 4], [2, 4]]
+    assert pairs(JointType.FREE) == fingers
+    assert pairs(JointType.FREE, collide=True) == sorted([*fingers, [0, 3], [1, 3], [2, 3]])
+    assert pairs(JointType.FIXED) == sorted([*fingers, [0, 3], [1, 3]])
 
 
 def test_scenes_without_joints_compile_no_kernel_of_joints():

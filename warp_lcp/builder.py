@@ -189,7 +189,7 @@ class ModelBuilder:
             limit: least and greatest coordinate (a pair for each, where there are several); infinite or None: no limit.
             drive: what pulls each coordinate.
             loop: never carry the child by this joint, hold both bodies where they are.
-            collide: let the shapes of the two bodies touch.
+            collide: let the shapes of the two bodies touch, and those of what hangs rigidly on them.
             name: 'joint<i>' if omitted.
 
         Raises:
@@ -508,12 +508,14 @@ class ModelBuilder:
 
         apart = [joint for joint in self._joints if min(joint.parent, joint.child) >= 0 and not joint.collide]
         joined = {frozenset((joint.parent, joint.child)) for joint in apart}
+        # What hangs rigidly on either side is as near to the joint; but a link may stand on what is fixed in the world with its base.
+        limbs = {frozenset(welded[[joint.parent, joint.child]]) for joint in apart if moves[joint.parent] and moves[joint.child]}
         pairs = []
         for j, b in enumerate(self._shapes):
             for i, a in enumerate(self._shapes[:j]):
                 if welded[a.body] == welded[b.body] or not (movable(a) or movable(b)) or (i, j) in self._filtered:
                     continue
-                if frozenset((a.body, b.body)) in joined:
+                if frozenset((a.body, b.body)) in joined or frozenset((welded[a.body], welded[b.body])) in limbs:
                     continue
                 first, second = (i, j) if a.type <= b.type else (j, i)
                 kind = (self._shapes[first].type, self._shapes[second].type)
