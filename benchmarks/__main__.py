@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks accuracy|stability|chart|speed|peers|friction|lcp|paper|robust|resources|needs|regression|all [--help]"""
+"""python -m benchmarks accuracy|stability|chart|speed|peers|friction|lcp|paper|dynamics|robots|robust|resources|needs|regression|all
+
+--help says what each does.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +19,7 @@ from . import (
     accuracy,
     chart,
     chart_picture,
+    dynamics,
     friction,
     goals,
     lcp,
@@ -26,6 +31,7 @@ from . import (
     regression,
     report,
     resources,
+    robot_speed,
     robust,
     speed,
     stability,
@@ -36,7 +42,7 @@ from .cases import CASES, case_names
 from .peers import compare
 
 #: What `all` does, in this order; together they make every number and picture of README and docs.
-EVERYTHING = ("speed", "accuracy", "stability", "chart", "friction", "lcp", "paper", "robust", "resources", "needs")
+EVERYTHING = ("speed", "accuracy", "stability", "chart", "friction", "lcp", "paper", "dynamics", "robots", "robust", "resources", "needs")
 
 
 def peer_names(text: str, known: Collection[str] = tuple(peers.PEERS)) -> list[str]:
@@ -96,6 +102,13 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     sub.add_argument("--problems", type=Path, default=Path("../shared/problems/lcp"), help="folder of .npz files with M, q, res")
     sub = command("paper", run_paper, "the paper's own comparison: formulations, lead matrices, Fig. 4", quick)
     sub.add_argument("--out", type=Path, help="folder of all files (default: benchmarks/results; unless --quick, docs as well)")
+    command("dynamics", run_dynamics, "kinematics, mass matrix and bias of robots from USD, beside MuJoCo's", out, quick, place)
+    sub = command("robots", run_robots, "speed of robots from USD beside other engines, falling and at rest (CPU)", out, quick, place)
+    sub.add_argument("names", nargs="*", metavar="ROBOT", help=f"of {', '.join(robot_speed.FILES)} (default: all)")
+    known = tuple(robot_speed.VARIANTS)
+    sub.add_argument(
+        "--peers", type=partial(peer_names, known=known), default=",".join(known), metavar="all|none|NAME,...", help="default: %(default)s"
+    )
     sub = command("robust", run_robust, "randomised environments of every shipped scene: what is certified", out, device)
     sub.add_argument("--scenes", type=lambda text: text.split(","), default=robust.scenes(), metavar="NAME,...", help="default: all")
     sub.add_argument("--formulations", type=lambda text: text.split(","), default=["phantom_inertia", "coulomb"], metavar="NAME,...")
@@ -104,7 +117,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     command("resources", run_resources, "what the kernels take of a GPU", out)
     command("needs", run_needs, "what each scene takes and uses, and what features elsewhere cost it (CPU)", out, quick)
     sub = command("regression", run_regression, "what got worse since the result that was kept last; status 1 if anything did")
-    sub.add_argument("new", type=Path, help="JSON file of accuracy, stability, chart, peers or speed")
+    sub.add_argument("new", type=Path, help="JSON file of accuracy, stability, chart, peers, robots or speed")
     sub.add_argument("old", type=Path, nargs="?", help="what to compare with (default: the one kept last in benchmarks/results)")
     command("all", run_all, f"one after the other: {', '.join(EVERYTHING)}; some hours", quick)
     others = commands.add_parser("peers", help="other engines on the same scenes").add_subparsers(dest="action", required=True)
@@ -283,6 +296,33 @@ def run_paper(asked: argparse.Namespace) -> None:
             asked.out.mkdir(parents=True, exist_ok=True)
         paper_picture.draw(data, (asked.out or report.DOCS) / "paper_comparison")
     keep(asked, device, data)
+
+
+def run_dynamics(asked: argparse.Namespace) -> None:
+    try:
+        data = dynamics.measure(asked.quick, asked.dir)
+    except FileNotFoundError as error:
+        raise SystemExit(f"python -m benchmarks: error: {error}") from error
+    print(dynamics.markdown(data))
+    keep(asked, wp.get_device("cpu"), data, not data["absent"])
+    if any(dynamics.problems(row) for row in data["rows"]):
+        raise SystemExit(1)
+
+
+def run_robots(asked: argparse.Namespace) -> None:
+    names = asked.names or list(robot_speed.FILES)
+    if unknown := [name for name in names if name not in robot_speed.FILES]:
+        raise SystemExit(f"python -m benchmarks: error: no robot {unknown[0]!r}; choose from {', '.join(robot_speed.FILES)}")
+    present, absent = peers.split(asked.peers, asked.dir)
+    if absent:
+        print(absent)
+    try:
+        data = robot_speed.measure(names, present, asked.quick, asked.dir)
+    except FileNotFoundError as error:
+        raise SystemExit(f"python -m benchmarks: error: {error}") from error
+    print(robot_speed.markdown(data))
+    complete = len(names) == len(robot_speed.FILES) and len(present) == len(robot_speed.VARIANTS) and not data["absent"]
+    keep(asked, wp.get_device("cpu"), data, complete)
 
 
 def run_robust(asked: argparse.Namespace) -> None:

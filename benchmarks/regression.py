@@ -122,6 +122,7 @@ KINDS: dict[str, Callable[[dict[str, Any], dict[str, Any]], list[str]]] = {
     "chart": chart,
     "peers": peers,
     "speed": peers,
+    "robots": peers,
 }
 
 

@@ -344,7 +344,7 @@ def functions(real) -> SimpleNamespace:
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """Kernels ``kinematics`` and ``free_motion`` of scenes with joints; launch with dim (E)."""
+    """Kernels of scenes with joints; ``dynamics`` of any scene. Launch with dim (E)."""
     t = scalar_types(real)
     vec3, mat33, quat, transform, spatial = t.vec3, t.mat33, t.quat, t.transform, t.spatial
     Bodies, Parameters, Topology = t.Bodies, t.Parameters, t.Topology
@@ -622,6 +622,35 @@ def make(real) -> SimpleNamespace:
         factorise(trees.before, trees.row, trees.factor, env)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def dynamics(
+        topology: Topology,
+        parameters: Parameters,
+        trees: Trees,
+        nothing: wp.array2d(dtype=spatial),
+        v: wp.array2d(dtype=real),
+        bodies: Bodies,
+        mass: wp.array3d(dtype=real),
+        bias: wp.array2d(dtype=real),
+        stride: int,
+    ):
+        """M(q), dense, and c(q, v) with what gravity takes from it, after kinematics; `nothing` is zero: wrenches are no part of c."""
+        start, _ = wp.tid()
+        for env in range(start, nothing.shape[0], stride):
+            mass_matrix(topology, parameters, trees, bodies, real(0.0), env)
+            for i in range(trees.before.shape[0]):
+                trees.mean[env, i] = v[env, i]
+                j = int(i)
+                for e in range(trees.row[i], trees.row[i + 1]):
+                    mass[env, i, j] = trees.matrix[env, e]
+                    mass[env, j, i] = trees.matrix[env, e]
+                    j = trees.before[j]
+            forces(topology, parameters, trees, nothing, bodies, env)
+            for i in range(trees.before.shape[0]):
+                bias[env, i] = -trees.change[env, i]
+                if trees.kind[i] == PRESCRIBED:
+                    bias[env, i] = real(0.0)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def free_motion(
         topology: Topology,
         parameters: Parameters,
@@ -723,4 +752,6 @@ def make(real) -> SimpleNamespace:
                 trees.target[env, i] = target[i]
                 trees.target_rate[env, i] = rate[i]
 
-    return SimpleNamespace(kinematics=kinematics, free_motion=free_motion, integrate=integrate, reset_control=reset_control)
+    return SimpleNamespace(
+        kinematics=kinematics, free_motion=free_motion, integrate=integrate, reset_control=reset_control, dynamics=dynamics
+    )

@@ -153,6 +153,7 @@ def test_mass_matrix_and_kinematics_of_every_joint():
             turn = np.array([joints.rotate(expected[b, 3:], e) for e in np.eye(3)]).T
             spatial = np.block([[model.mass[b] * np.eye(3), np.zeros((3, 3))], [np.zeros((3, 3)), turn @ model.inertia[b] @ turn.T]])
             mass += j[b].T @ spatial @ j[b]
+        assert np.abs(sim.mass_matrix().numpy()[0] - mass).max() < 1e-8 * np.abs(mass).max()
         sim.step()
         assert np.abs(mass_matrix(sim) - mass).max() < 1e-8 * np.abs(mass).max()
 
@@ -172,7 +173,7 @@ def mass_matrix(sim: wl.Simulator) -> np.ndarray:
 def test_accelerations_of_every_joint():
     """M a = -c with c = sum J^T (m (dJ/dt v - g), I dJ/dt v + w x I w), dJ/dt v by differences of velocities along the motion.
 
-    Their error is 1e-9 / 1e-4; a itself is known to 1e-16 / h = 1e-8.
+    Their error is 1e-9 / 1e-4; a itself is known to 1e-16 / h = 1e-8. bias() is c.
     """
     model, h = random_tree(), 1e-8
     sim = simulator(model, dt=h)
@@ -184,9 +185,6 @@ def test_accelerations_of_every_joint():
             sim.v.assign(v[None])
             rates.append(sim.body_velocity.numpy()[0].copy())
         rate = (rates[1] - rates[0]) / 2e-4
-        sim.q.assign(q[None])
-        sim.v.assign(v[None])
-        sim.step()
         pose, velocity, j = poses(model, q), rates[0] + rate * 1e-4, jacobian(model, q)
         bias = np.zeros(model.nv)
         for b in range(model.num_bodies):
@@ -194,8 +192,44 @@ def test_accelerations_of_every_joint():
             inertia, w = turn @ model.inertia[b] @ turn.T, velocity[b, 3:]
             force = np.r_[model.mass[b] * (rate[b, :3] - model.gravity), inertia @ rate[b, 3:] + np.cross(w, inertia @ w)]
             bias += j[b].T @ force
+        sim.q.assign(q[None])
+        sim.v.assign(v[None])
+        assert np.abs(sim.bias().numpy()[0] - bias).max() < 1e-7 * np.abs(bias).max()
+        sim.step()
         acceleration = (sim.v.numpy()[0] - v) / h
         assert np.abs(mass_matrix(sim) @ acceleration + bias).max() < 1e-5 * np.abs(bias).max()
+
+
+def test_mass_matrix_and_bias_of_free_and_kinematic_bodies():
+    """m, R I R^T; m (-g), w x I w; what is prescribed has neither. Masses and gravity of each environment."""
+    builder, turn = wl.ModelBuilder(), np.array([0.1, -0.5, 0.3, 0.8]) / np.sqrt(0.99)
+    inertia = np.array([[0.03, 0.004, 0.0], [0.004, 0.05, -0.002], [0.0, -0.002, 0.04]])
+    builder.add_body(pose=(1, 2, 3, *turn), angular_velocity=(3, -2, 1), mass=2.0, com=(0.1, 0.2, 0.0), inertia=inertia)
+    builder.add_body(angular_velocity=(1, 1, 1), joint=JointType.KINEMATIC, mass=1.0, inertia=inertia)
+    sim = simulator(builder, num_envs=2)
+    sim.set_parameters(gravity=np.array([[0, 0, -GRAVITY], [1.0, 0, 0]]), mass=np.array([[2.0, 1.0], [4.0, 1.0]]))
+    mass, bias = sim.mass_matrix().numpy(), sim.bias().numpy()
+    matrix, w = np.array([joints.rotate(turn, e) for e in np.eye(3)]).T, np.array([3.0, -2.0, 1.0])
+    for env, (m, g) in enumerate(((2.0, [0, 0, -GRAVITY]), (4.0, [1.0, 0, 0]))):
+        own = 0.5 * m * matrix @ inertia @ matrix.T
+        expected = np.eye(12)
+        expected[:3, :3], expected[3:6, 3:6] = m * np.eye(3), own
+        assert np.abs(mass[env] - expected).max() < 1e-14
+        assert np.abs(bias[env] - np.r_[-m * np.array(g), np.cross(w, own @ w), np.zeros(6)]).max() < 1e-13
+
+
+def test_asking_for_the_mass_matrix_changes_no_step():
+    """Bit for bit."""
+    ends = []
+    for asks in (False, True):
+        sim = simulator(quadruped(), dt=2e-3)
+        for _ in range(20):
+            sim.step(2)
+            if asks:
+                sim.mass_matrix()
+                sim.bias()
+        ends.append(np.r_[sim.q.numpy()[0], sim.v.numpy()[0]])
+    assert ends[0].tobytes() == ends[1].tobytes()
 
 
 def test_bodies_are_placed_where_joints_let_them():
@@ -565,6 +599,27 @@ def test_joints_that_are_none():
             builder.add_joint(**options)
     with pytest.raises(wl.WarpLcpError, match="no range"):
         builder.add_distance(-1, body, 2.0, 1.0)
+
+
+def test_bodies_that_hang_rigidly_on_each_other_are_as_one_body_to_touch():
+    """Two arms welded to a base touch neither it nor each other; a hand on a hinge of one of them passes through all three,
+    fingers beyond it do not. Where the base is fixed in the world, the hand touches what it is not joined to itself."""
+
+    def pairs(joint: JointType, collide: bool = False) -> list[list[int]]:
+        builder = wl.ModelBuilder()
+        for kind in (joint, *(JointType.FREE,) * 4):
+            builder.add_sphere(builder.add_body(joint=kind), 0.1)
+        builder.add_joint(JointType.FIXED, 0, 1, collide=True)
+        builder.add_joint(JointType.FIXED, 0, 2)
+        builder.add_joint(JointType.REVOLUTE, 2, 3, collide=collide)
+        builder.add_joint(JointType.REVOLUTE, 3, 4)
+        model = builder.finalize()
+        return sorted(sorted(pair) for pair in model.shape_body[model.pairs].tolist())
+
+    fingers = [[0, 4], [1, 4], [2, 4]]
+    assert pairs(JointType.FREE) == fingers
+    assert pairs(JointType.FREE, collide=True) == sorted([*fingers, [0, 3], [1, 3], [2, 3]])
+    assert pairs(JointType.FIXED) == sorted([*fingers, [0, 3], [1, 3]])
 
 
 def test_scenes_without_joints_compile_no_kernel_of_joints():

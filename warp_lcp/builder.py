@@ -189,7 +189,7 @@ class ModelBuilder:
             limit: least and greatest coordinate (a pair for each, where there are several); infinite or None: no limit.
             drive: what pulls each coordinate.
             loop: never carry the child by this joint, hold both bodies where they are.
-            collide: let the shapes of the two bodies touch.
+            collide: let the shapes of the two bodies touch, and those of what hangs rigidly on them.
             name: 'joint<i>' if omitted.
 
         Raises:
@@ -428,7 +428,7 @@ class ModelBuilder:
             up_axis=self.up_axis,
             report=Report() if report is None else report,
         )
-        return replace(model, pairs=self._pairs(model.movable))
+        return replace(model, pairs=self._pairs(model))
 
     def _forest(self, com: np.ndarray) -> dict[str, Any]:
         """Model's fields of bodies, joints and coordinates; coordinates in the order of the tree, parents first."""
@@ -525,18 +525,26 @@ class ModelBuilder:
             mass, inertia = body.mass, inertia * (body.mass / mass)
         return mass, com, inertia if body.inertia is None else body.inertia
 
-    def _pairs(self, moves: np.ndarray) -> np.ndarray:
+    def _pairs(self, model: Model) -> np.ndarray:
+        moves = model.movable
+        welded = np.arange(len(self._bodies) + 1)  # first of the bodies that hang rigidly on each other; they do not touch
+        for b in model.order:
+            if model.joint_type[b] == JointType.FIXED and model.body_parent[b] >= 0:
+                welded[b] = welded[model.body_parent[b]]
+
         def movable(s: _Shape) -> bool:
             return bool(moves[s.body])
 
         apart = [joint for joint in self._joints if min(joint.parent, joint.child) >= 0 and not joint.collide]
         joined = {frozenset((joint.parent, joint.child)) for joint in apart}
+        # What hangs rigidly on either side is as near to the joint; but a link may stand on what is fixed in the world with its base.
+        limbs = {frozenset(welded[[joint.parent, joint.child]]) for joint in apart if moves[joint.parent] and moves[joint.child]}
         pairs = []
         for j, b in enumerate(self._shapes):
             for i, a in enumerate(self._shapes[:j]):
-                if a.body == b.body or not (movable(a) or movable(b)) or (i, j) in self._filtered:
+                if welded[a.body] == welded[b.body] or not (movable(a) or movable(b)) or (i, j) in self._filtered:
                     continue
-                if frozenset((a.body, b.body)) in joined:
+                if frozenset((a.body, b.body)) in joined or frozenset((welded[a.body], welded[b.body])) in limbs:
                     continue
                 first, second = (i, j) if a.type <= b.type else (j, i)
                 kind = (self._shapes[first].type, self._shapes[second].type)

@@ -181,6 +181,7 @@ class Simulator:
         self.sign_tolerance = 1e-12 if self.real is wp.float64 else 1e-6
         self.rounding = 2.0**-50 if self.real is wp.float64 else 2.0**-21  # what a gap is known to, as a part of a coordinate
         self._types = scalar_types(self.real)
+        self.trees: Any = None  # of a model without joints only once somebody asks for M or c
         self._allocate()
         self._load_kernels()
         self._graphs: dict[str, Any] = {}
@@ -365,6 +366,36 @@ class Simulator:
         self._refresh_bodies()
         return self.bodies.velocity
 
+    def mass_matrix(self) -> wp.array:
+        """[E, nv, nv] M(q) of the present q, with armature: M dv/dt + c = f (eq. 13), symmetric; velocities as in :class:`Model`.
+
+        kg, kg m or kg m^2. Those of kinematic bodies are prescribed: their rows and columns are those of the identity.
+        """
+        return self._dynamics()[0]
+
+    def bias(self) -> wp.array:
+        """[E, nv] c(q, v) of the present state, N or N m: forces of Coriolis and of gyroscopes, less those of gravity.
+
+        What joints would have to give for no velocity to change, without contacts, wrenches, damping and drives. Zero
+        where velocities are prescribed.
+        """
+        return self._dynamics()[1]
+
+    def _dynamics(self) -> tuple[wp.array, wp.array]:
+        """M and c, by the functions of a step of trees, as which free bodies are looked at as well."""
+        k, n = tree.make(self.real), self.model.nv
+        if self.trees is None:
+            self.trees = articulation.arrays(self, tree.functions(self.real).Trees)
+            self._load([k.kinematics])
+        if k.dynamics not in self.kernels:
+            self._load([k.dynamics])
+        scene = [self.topology, self.parameters, self.trees]
+        mass, bias = wp.zeros((self.num_envs, n, n), dtype=self.real, device=self.device), self._array(n, self.real)
+        self.launch(k.kinematics, [self.q, self.v, *scene, self.bodies])
+        nothing = self._array(self.model.num_bodies, self._types.spatial)
+        self.launch(k.dynamics, [*scene, nothing, self.v, self.bodies, mass, bias])
+        return mass, bias
+
     def _refresh_bodies(self) -> None:
         if self.model.articulated:
             self.launch(self._kernels.kinematics, [self.q, self.v, self.topology, self.parameters, self.mechanics, self.bodies])
@@ -541,7 +572,7 @@ class Simulator:
         self.mechanics: Any = bundle
         self.control: Control | None = None
         if m.articulated:
-            trees = self.mechanics = articulation.arrays(self, tree.functions(self.real).Trees)
+            trees = self.mechanics = self.trees = articulation.arrays(self, tree.functions(self.real).Trees)
             self.control = Control(trees.target, trees.target_rate, trees.force)
             self._targets = [self._constant(m.drive[:, k], self.real) for k in (3, 4)]
 

@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from .. import motion, scenes
 from ..motion import Motion
+from ..robots import Robot
 from ..scenes import Scene
 from . import Peer
 from .session import Session, Task, session
@@ -68,7 +69,7 @@ def errors(scene: Scene, moved: Motion, expected: np.ndarray | None) -> dict[str
     return found | {"penetration": motion.penetration(scene, moved.pose[-1])}
 
 
-def problems(scene: Scene, done: Task) -> list[str]:
+def problems(scene: Scene | Robot, done: Task) -> list[str]:
     """Why a peer's run does not count: it did not simulate this scene, or not the same every time."""
     found = []
     for name, start, ours_start in (("pose", done.pose[0], scene.pose), ("velocity", done.velocity[0], scene.velocity)):
@@ -122,7 +123,7 @@ def one(scene: Scene, sessions: list[Session], repetitions: int) -> list[dict[st
     return rows
 
 
-def row(scene: Scene, engine: str, seconds: list[float], ours: list[float]) -> dict[str, Any]:
+def row(scene: Scene | Robot, engine: str, seconds: list[float], ours: list[float]) -> dict[str, Any]:
     """Speed of an engine, and of ours over it, turn by turn."""
     work, ratios = scene.envs * scene.steps, [theirs / mine for theirs, mine in zip(seconds, ours, strict=True)]
     rates = [work / s for s in seconds]

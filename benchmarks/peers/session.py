@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ..robots import Robot
 from ..scenes import Scene
 from . import Peer
 
@@ -109,7 +110,7 @@ class Session:
             raise PeerError(f"{self.peer.name}, {what}: {reply['error']}")
         return reply
 
-    def make(self, variant: str, scene: Scene, every: int = 1) -> Task:
+    def make(self, variant: str, scene: Scene | Robot, every: int = 1) -> Task:
         """Let the peer simulate a scene once, not timed, with a sample after every so many steps."""
         index = next(self.ids)
         state, result = self.work / f"state{index}.npz", self.work / f"result{index}.npz"

@@ -12,6 +12,8 @@ import protocol
 import warp as wp
 
 GENEROUS = 16  # contacts for each body in the run that finds how many are needed
+# warp_lcp.JointType and DofKind
+FREE, FIXED, SPHERICAL, LINEAR = 0, 2, 5, 0
 GAP = 0.005  # m, of each shape; or what the fastest body moves in a step, where that is more (Newton's own default is 0.1 m)
 
 
@@ -39,6 +41,50 @@ class NewtonEngine(protocol.Engine):
         """A free body; one whose solver wants no joints is a link."""
         world.add_body(**body)
 
+    def link(self, world: newton.ModelBuilder, **body: Any) -> None:
+        """A body whose joint is added apart."""
+        world.add_link(**body)
+
+    def joints(self, world: newton.ModelBuilder, tree: protocol.Tree) -> None:
+        """All joints of a tree, in the order of its coordinates; dampers are drives without a target."""
+        found = []
+        for body in np.argsort(tree.q_start, kind="stable").tolist():
+            parent, kind = int(tree.body_parent[body]), tree.joint_type[body]
+            frames = [wp.transform(*pose[body].tolist()) for pose in (tree.joint_pose, tree.joint_child_pose)]
+            where = {"parent": parent, "child": body, "parent_xform": frames[0], "child_xform": frames[1]}
+            axes: dict[bool, list[Any]] = {True: [], False: []}
+            for i in np.flatnonzero(tree.dof_body == body):
+                axes[bool(tree.dof_kind[i] == LINEAR)].append(self.axis(tree, i))
+            if kind == FREE:
+                found.append(world.add_joint_free(child=body))
+            elif kind == FIXED:
+                found.append(world.add_joint_fixed(**where))
+            elif kind == SPHERICAL:
+                raise protocol.Refused("balls are not written for Newton")
+            elif len(axes[False]) == 1 and not axes[True]:
+                found.append(world.add_joint_revolute(axis=axes[False][0], **where))
+            elif len(axes[True]) == 1 and not axes[False]:
+                found.append(world.add_joint_prismatic(axis=axes[True][0], **where))
+            else:
+                found.append(world.add_joint_d6(linear_axes=axes[True], angular_axes=axes[False], **where))
+        world.add_articulation(found)
+
+    def axis(self, tree: protocol.Tree, i: int) -> newton.ModelBuilder.JointDofConfig:
+        """A coordinate's limits and drive."""
+        stiffness, damping, force, target, target_velocity = tree.drive[i].tolist()
+        driven = bool(stiffness or damping)
+        if tree.joint_friction[i] or (driven and (np.isfinite(force) or target_velocity)):
+            raise protocol.Refused("drives of limited force or with a target velocity, and dry friction, are not written for Newton")
+        limits = {name: float(x) for name, x in zip(("limit_lower", "limit_upper"), tree.limit[i], strict=True) if np.isfinite(x)}
+        return newton.ModelBuilder.JointDofConfig(
+            axis=wp.vec3(*tree.dof_axis[i].tolist()),
+            armature=float(tree.armature[i]),
+            target_q=target,
+            target_ke=stiffness,
+            target_kd=damping + float(tree.damping[i]),
+            **limits,
+        )
+
     def build(self) -> newton.Model:
         """All environments, one world each; colliders of the world belong to every one of them."""
         job = self.job
@@ -49,8 +95,15 @@ class NewtonEngine(protocol.Engine):
         gravity = tuple(job.gravity.tolist())
         world = newton.ModelBuilder(gravity=gravity)
         self.register(world)
-        for pose, mass, inertia in zip(job.pose[0], job.mass.tolist(), job.inertia, strict=True):
-            self.add(world, xform=wp.transform(*pose.tolist()), mass=mass, inertia=wp.mat33(np.diag(inertia)), lock_inertia=True)
+        for b, (pose, mass, inertia) in enumerate(zip(job.pose[0], job.mass.tolist(), job.inertia, strict=True)):
+            full = inertia if inertia.ndim == 2 else np.diag(inertia)
+            body = {"xform": wp.transform(*pose.tolist()), "mass": mass, "inertia": wp.mat33(full), "lock_inertia": True}
+            if job.tree is None:
+                self.add(world, **body)
+            else:
+                self.link(world, com=wp.vec3(*job.tree.com[b].tolist()), **body)
+        if job.tree is not None:
+            self.joints(world, job.tree)
         builder = newton.ModelBuilder(gravity=gravity)
         self.register(builder)
         for kind, body, size, pose in zip(job.shape_kind, job.shape_body, job.shape_size.tolist(), job.shape_pose, strict=True):
@@ -61,10 +114,27 @@ class NewtonEngine(protocol.Engine):
                 target.add_shape_box(hx=size[0], hy=size[1], hz=size[2], **place)
             elif kind == "sphere":
                 target.add_shape_sphere(radius=size[0], **place)
+            elif kind == "cylinder":
+                target.add_shape_cylinder(radius=size[0], half_height=size[1], **place)
             else:
                 target.add_shape_capsule(radius=size[0], half_height=size[1], **place)
+        if job.tree is not None:
+            self.filter(world, job)
         builder.replicate(world, job.envs)
         return builder.finalize(device="cpu")
+
+    @staticmethod
+    def filter(world: newton.ModelBuilder, job: protocol.Job) -> None:
+        """Shapes of the robot that pass through each other; with the world's all of them touch."""
+        touching = {frozenset(pair) for pair in job.tree.pairs.tolist()}
+        own = [i for i, body in enumerate(job.shape_body) if body >= 0]  # in the order of the world's shapes
+        static = [i for i, body in enumerate(job.shape_body) if body < 0]
+        if any(frozenset((i, j)) not in touching for i in own for j in static):
+            raise protocol.Refused("shapes that pass through the world are not written for Newton")
+        for b, j in enumerate(own):
+            for a, i in enumerate(own[:b]):
+                if frozenset((i, j)) not in touching:
+                    world.add_shape_collision_filter_pair(a, b)
 
     def allocate(self, contacts: int) -> None:
         """A pipeline and a solver with room for this many contacts in all environments together, and graphs of their steps."""
@@ -97,6 +167,11 @@ class NewtonEngine(protocol.Engine):
         self.steps = 0
         self.states[0].body_q.assign(self.job.pose.reshape(-1, 7))
         self.states[0].body_qd.assign(self.job.velocity.reshape(-1, 6))
+        if self.job.tree is not None:  # bodies where the joints have them: a check of the joints that costs no step
+            state, tree = self.states[0], self.job.tree
+            state.joint_q.assign(tree.q.reshape(-1))
+            state.joint_qd.assign(tree.v.reshape(-1))
+            newton.eval_fk(self.model, state.joint_q, state.joint_qd, state)
 
     def run(self, steps: int) -> None:
         """The CPU's launches are synchronous."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import mjcf
 import mujoco
+import mujoco_states
 import numpy as np
 import protocol
 from mujoco import rollout
@@ -24,7 +25,7 @@ class MuJoCo(protocol.Engine):
         self.data = mujoco.MjData(self.model)
         size = mujoco.mj_stateSize(self.model, FULL)
         assert size == 1 + self.model.nq + self.model.nv, "a state is time, qpos, qvel"
-        self.start = np.concatenate([np.zeros((job.envs, 1)), *mjcf.to_mujoco(job.pose, job.velocity)], axis=1)
+        self.start = np.concatenate([np.zeros((job.envs, 1)), *mujoco_states.start(job)], axis=1)
         self.pool = rollout.Rollout(nthread=0)
         self.control: dict[str, Any] = {}
         if job.wrench.any():
@@ -48,7 +49,7 @@ class MuJoCo(protocol.Engine):
 
     def unpacked(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of states [..., 1 + nq + nv]."""
-        return mjcf.from_mujoco(states[..., 1 : 1 + self.model.nq], states[..., 1 + self.model.nq :])
+        return mujoco_states.bodies(self.job, self.model, states[..., 1 : 1 + self.model.nq], states[..., 1 + self.model.nq :])
 
     def contacts(self) -> float:
         """Counted in some of the states of the trajectories."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import mjcf
 import mujoco
+import mujoco_states
 import mujoco_warp as mjw
 import numpy as np
 import protocol
@@ -23,7 +24,7 @@ class MuJoCoWarp(protocol.Engine):
         wp.set_device("cpu")
         self.job, self.spec = job, mujoco.MjModel.from_xml_string(mjcf.model(job))
         self.model = mjw.put_model(self.spec)
-        self.qpos, self.qvel = mjcf.to_mujoco(job.pose, job.velocity)
+        self.qpos, self.qvel = mujoco_states.start(job)
         self.applied = np.zeros((job.envs, len(job.mass) + 1, 6))  # the world first
         self.applied[:, 1:] = job.wrench
         bodies = len(job.mass)
@@ -55,7 +56,7 @@ class MuJoCoWarp(protocol.Engine):
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Read back."""
-        return mjcf.from_mujoco(self.data.qpos.numpy().astype(float), self.data.qvel.numpy().astype(float))
+        return mujoco_states.bodies(self.job, self.spec, self.data.qpos.numpy().astype(float), self.data.qvel.numpy().astype(float))
 
     def contacts(self) -> float:
         """Counts candidates and rows as well: pairs to look at share the contacts' memory."""

@@ -28,27 +28,36 @@ class NewtonSteel(NewtonEngine):
         """No damping: by default a body loses 5 % of its angular velocity in a second, which no scene asks for."""
         world.add_body(custom_attributes={"steel:rigid_body_angular_damping": 0.0}, **body)
 
+    def link(self, world: newton.ModelBuilder, **body: Any) -> None:
+        """Likewise."""
+        world.add_link(custom_attributes={"steel:rigid_body_angular_damping": 0.0}, **body)
+
     def solver(self) -> newton.solvers.SolverBase:
         """With room for rows: plenty in the untimed run, which counts them, then what that one needed."""
         rows = self.rows or ROWS * GENEROUS * max(len(self.job.mass), 1)
-        return newton.solvers.SolverSteel(self.model, free_body_constraint_max=rows, row_watermark=self.rows == 0, **self.job.settings)
+        options = {"free_body_constraint_max": rows}
+        if self.job.tree is not None:
+            options = {"articulation_constraint_max": rows, "free_body_constraint_max": 1, "enable_joint_limits": True}
+        return newton.solvers.SolverSteel(self.model, row_watermark=self.rows == 0, **options, **self.job.settings)
 
     def reset(self) -> None:
         """The joints' coordinates too."""
         super().reset()
-        self.states[0].joint_q.assign(self.job.pose.reshape(-1))
-        self.states[0].joint_qd.assign(self.job.velocity.reshape(-1))
+        if self.job.tree is None:
+            self.states[0].joint_q.assign(self.job.pose.reshape(-1))
+            self.states[0].joint_qd.assign(self.job.velocity.reshape(-1))
         self.engine.reset(self.states[0])
 
     def settle(self) -> None:
         """As many rows as the fullest environment had."""
-        self.rows = max(self.engine.constraint_row_watermarks()["free_body_raw_high_water"], 1)
+        family = "free_body" if self.job.tree is None else "articulation"
+        self.rows = max(self.engine.constraint_row_watermarks()[f"{family}_raw_high_water"], 1)
         super().settle()
 
     def info(self) -> dict[str, Any]:
         """The solver's own flags say whether it dropped rows since the reset."""
         info = super().info()
-        return info | {"free_body_rows": self.rows, "overflow": info["overflow"] or bool(self.engine.constraint_overflow.numpy().any())}
+        return info | {"rows": self.rows, "overflow": info["overflow"] or bool(self.engine.constraint_overflow.numpy().any())}
 
 
 if __name__ == "__main__":

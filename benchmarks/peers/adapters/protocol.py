@@ -5,10 +5,10 @@ Orders, each with the "id" of a job that the caller chooses:
 
     {"do": "make", "id", "job": {scene, dt, steps, every, friction, restitution, settings, state, result}}
         Build the engine and run the job once, with everything recorded. `state` is the .npz that benchmarks.scenes.Scene.save
-        writes. The reply is {info, seconds: of the run}; the .npz `result` holds pose [T, E, B, 7] (x y z qx qy qz qw) and velocity
-        [T, E, B, 6] (linear of the centre of mass, then angular; world axes) at the start and after every `every` steps, as the
-        engine gives them back, before_pose and before_velocity [T - 1, E, B, ..], one step before each of the later samples, and
-        contacts, their mean number in an environment and a step.
+        or, with joints, benchmarks.robots.Robot.save writes. The reply is {info, seconds: of the run}; the .npz `result` holds
+        pose [T, E, B, 7] (x y z qx qy qz qw) and velocity [T, E, B, 6] (linear of the centre of mass, then angular; world axes)
+        at the start and after every `every` steps, as the engine gives them back, before_pose and before_velocity
+        [T - 1, E, B, ..], one step before each of the later samples, and contacts, their mean number in an environment and a step.
     {"do": "run", "id"}
         All steps from the start, timed. The reply is {seconds, same, info}: same says whether it ended where the first run did.
     {"do": "drop", "id"}
@@ -28,13 +28,14 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 State = tuple[np.ndarray, np.ndarray]
+KINDS = ("plane", "box", "sphere", "capsule", "cylinder")
 SHAPES = ("shape_kind", "shape_body", "shape_size", "shape_pose")
 BODIES = ("mass", "inertia", "pose", "velocity", "gravity", "wrench")
 
@@ -44,8 +45,35 @@ class Refused(Exception):
 
 
 @dataclass(frozen=True)
+class Tree:
+    """Joints of a robot: fields of warp_lcp's Model under their names, its start in its coordinates, q [E, nq] and v [E, nv]."""
+
+    body_parent: np.ndarray
+    joint_type: np.ndarray
+    joint_pose: np.ndarray
+    joint_child_pose: np.ndarray
+    q_start: np.ndarray
+    v_start: np.ndarray
+    dof_body: np.ndarray
+    dof_kind: np.ndarray
+    dof_axis: np.ndarray
+    armature: np.ndarray
+    damping: np.ndarray
+    joint_friction: np.ndarray
+    limit: np.ndarray
+    drive: np.ndarray
+    com: np.ndarray
+    pairs: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+
+
+@dataclass(frozen=True)
 class Job:
-    """One scene to simulate; the arrays are those of benchmarks.scenes.Scene, `every` the steps from sample to sample."""
+    """One scene to simulate; the arrays are those of benchmarks.scenes.Scene, `every` the steps from sample to sample.
+
+    Where bodies hang on joints, `tree` says how, and inertia is [B, 3, 3], about the centre of mass.
+    """
 
     scene: str
     dt: float
@@ -64,6 +92,11 @@ class Job:
     velocity: np.ndarray
     gravity: np.ndarray
     wrench: np.ndarray
+    tree: Tree | None = None
+
+    def __post_init__(self) -> None:
+        if unknown := set(self.shape_kind) - set(KINDS):
+            raise Refused(f"adapters write {', '.join(KINDS)}, and there is a {sorted(unknown)[0]}")
 
     @property
     def envs(self) -> int:
@@ -132,8 +165,9 @@ def read(order: dict[str, Any]) -> Job:
     given = order["job"]
     with np.load(given["state"]) as state:
         arrays = {name: state[name] for name in (*SHAPES, *BODIES)}
+        tree = Tree(**{field.name: state[field.name] for field in fields(Tree)}) if "joint_type" in state else None
     arrays |= {name: arrays[name].tolist() for name in ("shape_kind", "shape_body")}
-    return Job(**{key: given[key] for key in ("scene", "dt", "steps", "every", "friction", "restitution", "settings")}, **arrays)
+    return Job(**{key: given[key] for key in ("scene", "dt", "steps", "every", "friction", "restitution", "settings")}, **arrays, tree=tree)
 
 
 def make(order: dict[str, Any], build: Callable[[Job], Engine]) -> tuple[Engine, np.ndarray, dict[str, Any]]:
