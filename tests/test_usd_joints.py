@@ -156,3 +156,14 @@ def test_robots_made_by_others_load(shared, file, bodies, nv, mass):
     model = wl.load_usd(shared / "usd" / file)
     assert (model.num_bodies, model.dofs) == (bodies, nv)
     assert model.mass[model.movable[:-1]].sum() == pytest.approx(mass, rel=1e-4)
+
+
+def test_numbers_are_the_decimals_that_were_written():
+    """USD keeps single precision, in which 0.1 reads 0.1000000015: bodies would be moved by that to where joints let them."""
+    frames = "point3f physics:localPos0 = (0.1, 0, 0); point3f physics:localPos1 = (-0.1, 0.7, 0); float physics:upperLimit = 0.3;"
+    drive = "float drive:linear:physics:stiffness = 0.9; float drive:linear:physics:maxForce = 0.6;"
+    model = load(*pair("Prismatic", frames + "float physics:lowerLimit = -0.7;" + drive, ("PhysicsDriveAPI:linear",)))
+    assert model.joint_pose[1, :3].tolist() == [0.1, 0, 0]
+    assert model.joint_child_pose[1, :3].tolist() == [-0.1, 0.7, 0]
+    assert model.limit[6].tolist() == [-0.7, 0.3]
+    assert model.drive[6, [0, 2]].tolist() == [0.9, 0.6]
