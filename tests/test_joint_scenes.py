@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 from test_joints import chain_end
 
 import warp_lcp as wl
+from benchmarks.cases.jointed import crank_reference
 from warp_lcp import joints
 from warp_lcp.model import JointType
 
@@ -86,43 +87,9 @@ def test_chain_converges_to_where_it_should_be():
 # ------------------------------------------------------------------------------------------------------------------- loops
 
 
-def crank_angle(time: float) -> float:
-    """Of the scene `fourbar` [rad]: Lagrange's equation of its one degree of freedom, the other angles by where two circles meet."""
-    ground, bars, masses = 1.0, np.array([0.3, 0.9, 0.6]), np.array([3.0, 9.0, 6.0])
-
-    def angles(crank: float) -> np.ndarray:
-        pin = bars[0] * np.array([np.cos(crank), np.sin(crank)])
-        away = np.array([ground, 0.0]) - pin
-        far = np.hypot(*away)
-        along = (bars[1] ** 2 - bars[2] ** 2 + far**2) / (2 * far)
-        up = np.array([-away[1], away[0]]) / far
-        meet = pin + along * away / far + np.sqrt(bars[1] ** 2 - along**2) * up
-        return np.array([crank, np.arctan2(*(meet - pin)[::-1]), np.arctan2(meet[1], meet[0] - ground)])
-
-    def rates(crank: float) -> np.ndarray:
-        """Of the three angles by the crank's: pin speeds along and across agree."""
-        a, b, c = angles(crank)
-        matrix = np.array([[-bars[1] * np.sin(b), bars[2] * np.sin(c)], [bars[1] * np.cos(b), -bars[2] * np.cos(c)]])
-        return np.r_[1.0, np.linalg.solve(matrix, bars[0] * np.array([np.sin(a), -np.cos(a)]))]
-
-    def inertia_and_height(crank: float) -> np.ndarray:
-        (a, b, c), (_, wb, wc) = angles(crank), rates(crank)
-        middle = np.array([-np.sin(a), np.cos(a)]) * bars[0] + 0.5 * bars[1] * wb * np.array([-np.sin(b), np.cos(b)])
-        own = masses * bars**2 / 12
-        inertia = masses[0] * bars[0] ** 2 / 3 + masses[1] * middle @ middle + own[1] * wb**2 + masses[2] * bars[2] ** 2 / 3 * wc**2
-        height = masses @ [0.5 * bars[0] * np.sin(a), bars[0] * np.sin(a) + 0.5 * bars[1] * np.sin(b), 0.5 * bars[2] * np.sin(c)]
-        return np.array([inertia, GRAVITY * height])
-
-    def motion(_, y):
-        slope = (inertia_and_height(y[0] + 1e-5) - inertia_and_height(y[0] - 1e-5)) / 2e-5
-        return np.array([y[1], -(0.5 * slope[0] * y[1] ** 2 + slope[1]) / inertia_and_height(y[0])[0]])
-
-    return float(solve_ivp(motion, (0, time), [0.0, 6.0], method="DOP853", rtol=1e-9, atol=1e-9).y[0, -1])
-
-
 def test_fourbar_turns_as_it_should():
     """Against its equation in the crank's angle: 5.6 rad/s h, of first order, after 2 s and a turn and an eighth."""
-    known, errors = crank_angle(2.0), []
+    known, errors = crank_reference()[0], []
     for h in (2e-3, 1e-3, 5e-4):
         angle = run(shipped("fourbar"), 2.0, h).q.numpy()[-1, 0, 0]
         errors.append(abs(-angle - known))  # the joint's angle counts from z to x
