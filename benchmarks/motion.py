@@ -17,7 +17,7 @@ from .scenes import Scene
 
 @dataclass(frozen=True)
 class Motion:
-    """T samples of E environments of B free bodies, the first of them the start.
+    """T samples of E environments of B bodies, the first of them the start.
 
     Attributes:
         scene: what was simulated.
@@ -57,7 +57,11 @@ class Motion:
         """[T, E] J: kinetic and of gravity, less the work of the scene's constant forces; friction and impacts may only lower it."""
         mass, x, v = self.scene.mass, self.pose[..., :3], self.velocity
         spin = rotate(self.pose[..., 3:] * [-1, -1, -1, 1], v[..., 3:])
-        kinetic = 0.5 * (mass * (v[..., :3] ** 2).sum(axis=-1) + (self.scene.inertia * spin**2).sum(axis=-1))
+        turning = (self.scene.inertia * spin**2).sum(axis=-1)
+        if self.scene.made is not None:
+            turning = np.einsum("...i,...ij,...j", spin, self.scene.made.inertia, spin)
+            x = x + rotate(self.pose[..., 3:], self.scene.made.com)
+        kinetic = 0.5 * (mass * (v[..., :3] ** 2).sum(axis=-1) + turning)
         force = mass[:, None] * np.array(self.scene.gravity)
         if self.scene.wrench is not None:
             force = force + self.scene.wrench[:, :3]
@@ -82,12 +86,13 @@ def record(sim: wl.Simulator, scene: Scene, every: int = 1, limit: float = math.
     """
     scene.restart(sim)
     begin = time.perf_counter()
-    samples, before, watched, contacts = [(sim.q.numpy().copy(), sim.v.numpy().copy())], [], [], []
+    state = ("q", "v") if scene.made is None else ("body_pose", "body_velocity")
+    samples, before, watched, contacts = [tuple(getattr(sim, name).numpy().copy() for name in state)], [], [], []
     for i in range(scene.steps // every):
         if (elapsed := time.perf_counter() - begin) > limit:
             raise TooSlow(f"{i * every} of {scene.steps} steps after {elapsed:.0f} s, {1e3 * elapsed / max(i * every, 1):.2g} ms each")
-        run = sim.rollout(every, record=("q", "v", "status", "residual", "iterations"))
-        q, v = run.q.numpy(), run.v.numpy()
+        run = sim.rollout(every, record=(*state, "status", "residual", "iterations"))
+        q, v = (getattr(run, name).numpy() for name in state)
         before.append((q[-2], v[-2]) if every > 1 else samples[-1])
         samples.append((q[-1], v[-1]))
         watched.append((run.status.numpy(), run.residual.numpy(), run.iterations.numpy()))
@@ -110,7 +115,10 @@ def simulate(scene: Scene, every: int = 1, material: dict[str, Any] | None = Non
 
 
 def penetration(scene: Scene, poses: np.ndarray) -> float:
-    """Deepest overlap [m] of anybody's poses [..., B, 7], measured by our collision detection; NaN if they are not finite."""
+    """Deepest overlap [m] of anybody's poses [..., B, 7], measured by our collision detection; NaN if they are not finite.
+
+    Of scenes that are not a Model of their own.
+    """
     if not np.isfinite(poses).all():
         return float("nan")
     flat = poses.reshape(-1, *poses.shape[-2:])

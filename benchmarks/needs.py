@@ -17,6 +17,7 @@ from unittest import mock
 
 import numpy as np
 import warp as wp
+from warp_lcp.kernels.types import HELD
 
 import warp_lcp as wl
 from warp_lcp import scenes as shipped
@@ -67,9 +68,10 @@ def allocated(sim: wl.Simulator) -> int:
 
 
 def rows(sim: wl.Simulator) -> np.ndarray:
-    """[E] rows of the LCP of the last step (eq. 39): a contact has one, and two for each of its friction directions."""
+    """[E] rows of the LCP of the last step (eq. 39): a contact has one, and two for each of its friction directions; a loop three."""
     count, directions = sim.rows.count.numpy(), sim.rows.directions.numpy()
-    return np.where(np.arange(directions.shape[1]) < count[:, None], 1 + 2 * directions, 0).sum(axis=1)
+    sizes = np.where(directions == HELD, 3, 1 + 2 * directions)
+    return np.where(np.arange(directions.shape[1]) < count[:, None], sizes, 0).sum(axis=1)
 
 
 def used(sim: wl.Simulator, steps: int, bodies: int = 0) -> tuple[dict[str, float], np.ndarray]:
@@ -82,7 +84,7 @@ def used(sim: wl.Simulator, steps: int, bodies: int = 0) -> tuple[dict[str, floa
     motion = np.empty((steps, sim.num_envs, 13 * bodies))
     for k in range(steps):
         sim.step()
-        counts[k], sizes[k] = sim.rows.count.numpy(), rows(sim)
+        counts[k], sizes[k] = sim.contacts.count.numpy(), rows(sim)
         motion[k, :, : 7 * bodies], motion[k, :, 7 * bodies :] = sim.q.numpy()[:, : 7 * bodies], sim.v.numpy()[:, : 6 * bodies]
     numbers = {"contacts_mean": counts.mean(), "contacts_largest": counts.max(), "rows_mean": sizes.mean(), "rows_largest": sizes.max()}
     return {name: float(value) for name, value in numbers.items()}, motion

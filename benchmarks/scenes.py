@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 import warp_lcp as wl
+from warp_lcp.builder import CONTACT_FIELDS
 
 DT = 1e-3
 GRAVITY = 9.81
@@ -56,6 +57,10 @@ class Scene:
         pose: [E, B, 7] start, x y z qx qy qz qw. velocity: [E, B, 6] start, linear then angular, world axes.
         gravity: [3] m/s^2.
         wrench: [B, 6] constant force [N] at the centre of mass and torque [N m], world axes; None: none.
+        made: the scene's Model where the above cannot say it (joints, belts, two coefficients of friction); shapes, friction, inertia and
+            starts are then not looked at. All environments are alike, and other engines have no part in it.
+        passive: nothing but gravity, constant forces, friction and impacts changes the energy. It is not where drives or belts do work, nor
+            where joints carry a swing, of which Euler's rule gives and takes a part of first order in the step.
     """
 
     name: str
@@ -70,6 +75,8 @@ class Scene:
     gravity: tuple[float, float, float] = (0.0, 0.0, -GRAVITY)
     wrench: np.ndarray | None = None
     restitution: float = 0.0
+    made: wl.Model | None = None
+    passive: bool = True
 
     @property
     def envs(self) -> int:
@@ -83,6 +90,11 @@ class Scene:
 
     def model(self, **material: Any) -> wl.Model:
         """The scene as environment 0 has it; `material` are further arguments of every contact's wl.Material."""
+        if self.made is not None:
+            contact = self.made.contact.copy()
+            for name, value in material.items():
+                contact[:, CONTACT_FIELDS.index(name)] = value
+            return replace(self.made, contact=contact)
         builder = wl.ModelBuilder(gravity=self.gravity)
         surface = wl.Material(self.friction, self.friction, restitution=self.restitution, **material)
         for mass, inertia, pose, velocity in zip(self.mass, self.inertia, self.pose[0], self.velocity[0], strict=True):
@@ -104,8 +116,9 @@ class Scene:
     def simulator(self, dt: float | None = None, material: dict[str, Any] | None = None, **options: Any) -> wl.Simulator:
         """A Simulator of the scene, every environment at its start; dt of the scene unless given."""
         sim = wl.Simulator(self.model(**material or {}), self.envs, self.dt if dt is None else dt, **options)
-        sim.q0.assign(self.pose.reshape(self.envs, -1))
-        sim.v0.assign(self.velocity.reshape(self.envs, -1))
+        if self.made is None:
+            sim.q0.assign(self.pose.reshape(self.envs, -1))
+            sim.v0.assign(self.velocity.reshape(self.envs, -1))
         self.restart(sim)
         return sim
 
@@ -130,6 +143,15 @@ class Scene:
             gravity=np.array(self.gravity),
             wrench=np.zeros((len(self.mass), 6)) if self.wrench is None else self.wrench,
         )
+
+
+def of_model(name: str, model: wl.Model, dt: float, steps: int, **options: Any) -> Scene:
+    """A scene of one environment that is this Model."""
+    sim = wl.Simulator(model, device="cpu")
+    pose, velocity = sim.body_pose.numpy().astype(float), sim.body_velocity.numpy().astype(float)
+    gravity = (float(model.gravity[0]), float(model.gravity[1]), float(model.gravity[2]))
+    inertia = np.linalg.eigvalsh(model.inertia)
+    return Scene(name, dt, steps, 0.0, (), model.mass, inertia, pose, velocity, gravity=gravity, made=model, **options)
 
 
 # ------------------------------------------------------------------------------------------------------------- solid bodies

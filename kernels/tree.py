@@ -56,6 +56,8 @@ STIFF = wp.constant(0.01)
 # ... and where it is more than this part, the velocity is damped by this part of h times the stiffness.
 UNRESOLVED = wp.constant(1.0)
 CALM = wp.constant(0.1)
+# Where a step does not resolve c, M_ii is this part larger for joints, which takes a third of their velocity.
+SLOWED = wp.constant(0.5)
 
 
 @functools.cache
@@ -691,9 +693,17 @@ def make(real) -> SimpleNamespace:
                     if stiffen(topology, parameters, trees, wrench, bodies, h, env):
                         searching = True
                 elif searching and rounds > 2 and moved > real(0.5) * before:
-                    # Rounds do not settle: c at the velocities before the step, and no more.
+                    # Rounds do not settle, a joint turns by about a radian in a step: without c, which would grow with the square of v,
+                    # and joints calmed, as turning from one pose to another feeds them.
                     for i in range(n):
-                        trees.mean[env, i] = v[env, i]
+                        trees.mean[env, i] = real(0.0)
+                        if trees.kind[i] < FREE:
+                            own = real(SLOWED) * trees.matrix[env, trees.row[i]]
+                            trees.calming[env, i] = trees.calming[env, i] + own / h
+                            trees.matrix[env, trees.row[i]] = trees.matrix[env, trees.row[i]] + own
+                    for e in range(trees.matrix.shape[1]):
+                        trees.factor[env, e] = trees.matrix[env, e]
+                    factorise(trees.before, trees.row, trees.factor, env)
                     rounds = BIAS_ROUNDS - 1
                 before = moved
             for i in range(n):

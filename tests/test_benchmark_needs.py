@@ -38,13 +38,14 @@ def test_ledger_is_what_a_simulator_takes(name):
     assert facts["bytes_per_env"] == needs.allocated(sim)
     assert sorted(facts["kernels"]) == sorted(needs.compiled(sim))
     assert sim.slots.gap.shape == (211, facts["contact_slots"])
-    assert sim.contacts.gap.shape == (211, facts["max_contacts"])
-    assert facts["largest_lcp"] == 5 * facts["max_contacts"]
+    assert sim.contacts.gap.shape == (211, facts["max_contacts"] + facts["joint_rows"])
+    assert facts["largest_lcp"] == min(5 * (facts["max_contacts"] + facts["joint_rows"]), 2000)
+    assert (facts["joint_rows"] > 0) == bool(len(sim.model.loops) or np.isfinite(sim.model.limit).any())
 
 
 @pytest.mark.parametrize("name", scenes.names())
 def test_shipped_scenes_compile_kernels_of_what_is_in_them(name):
-    """A kernel for each kind of pair, of restitution where something bounces, of one or of several bodies; and no other."""
+    """A kernel for each kind of pair, of restitution where something bounces, of joints, of one or of several bodies; and no other."""
     scene = wl.load_usd(name)
     stages = {"kinematics", "free_motion", "combine_pairs", "select_contacts", "certify", "integrate", "reset", "proximal_contacts", "pgs"}
     pairs = {"_".join(wl.ShapeType(scene.shape_type[s]).name.lower() for s in pair) for pair in scene.pairs}
@@ -52,7 +53,9 @@ def test_shipped_scenes_compile_kernels_of_what_is_in_them(name):
     bounces = {"bounce", "judge", "settle"} if scene.bounces else set()
     single = scene.dofs == 6
     rows = {"contact_rows"} if bounces or not single else set()
-    assert set(ledger(scene)["kernels"]) == stages | pairs | bounds | bounces | rows | {"solve_single" if single else "pivot"}
+    joints = {"reset_control"} if scene.articulated else set()
+    joints |= {"joint_rows"} if ledger(scene)["joint_rows"] else set()
+    assert set(ledger(scene)["kernels"]) == stages | pairs | bounds | bounces | rows | joints | {"solve_single" if single else "pivot"}
 
 
 def test_features_compile_only_their_own_kernels():

@@ -338,6 +338,30 @@ def test_chain_with_a_heavy_end_in_long_steps(h):
     assert highest < 0.01 * 100.0 * GRAVITY
 
 
+@pytest.mark.parametrize("speed", [30.0, 300.0, 3000.0])
+def test_joints_that_no_step_resolves(speed):
+    """Up to 30 rad a step, without weight: what links do to one another while they turn is out of reach, but nothing grows of it.
+
+    Some velocities grow in the first steps, by turning from one pose to another, and none later. c at the velocities before the step, which
+    grows with their square, ends in no number at all.
+    """
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    bodies = [builder.add_body(pose=(0.2 * k, 0, 0, 0, 0, 0, 1), mass=1.0 + k, inertia=SMALL * (1 + k)) for k in range(4)]
+    for k, axis in ((1, ABOUT_Z), (2, ABOUT_Y), (3, ABOUT_Z)):
+        frames = {"parent_frame": (0.1, 0, 0, *axis), "child_frame": (-0.1, 0, 0, *axis)}
+        builder.add_joint(JointType.REVOLUTE, bodies[k - 1], bodies[k], **frames)
+    sim = simulator(builder, num_envs=16, dt=1e-2)
+    start = speed * np.random.default_rng(3).normal(size=(16, sim.model.nv))
+    sim.v.assign(start)
+    highest = []
+    for _ in range(10):
+        sim.step(100)
+        assert not sim.status.numpy().any()
+        highest.append(np.abs(sim.v.numpy()).max())
+    assert max(highest) < 10.0 * np.abs(start).max()
+    assert max(highest[1:]) < 1.2 * highest[0]
+
+
 def test_heavy_top_precesses():
     """Steady precession with spin 100 rad/s at 30 degrees: its rate, of first order in h."""
     i_1, i_3, mgl, spin, tilt = 0.1, 0.02, 0.5, 100.0, np.pi / 6

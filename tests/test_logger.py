@@ -168,6 +168,22 @@ def test_residuals_iterations_and_energy(tmp_path):
     assert [t for t, _ in read(path, "/plots/residual", "Scalars:scalars")] == [1, 2]
 
 
+def test_energy_of_bodies_on_joints(tmp_path):
+    """A body that a joint carries has energy as a free one has: m g z of a pendulum on a hinge 2 m up, plus what its fall made."""
+    builder = wl.ModelBuilder()
+    bob = builder.add_body(pose=(1.0, 0, 2.0, 0, 0, 0, 1), mass=3.0, inertia=1e-9 * np.eye(3))
+    frames = {"parent_frame": (0, 0, 2.0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)), "child_frame": (-1.0, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5))}
+    builder.add_joint(wl.JointType.REVOLUTE, -1, bob, **frames)
+    builder.add_sphere(bob, 0.1)
+    path = tmp_path / "run.rrd"
+    sim, _, _ = simulate(path, builder.finalize(), frames=50, every=1, envs=[0])
+    (_, first), *_, (_, last) = read(path, "/plots/energy", "Scalars:scalars")
+    pose, velocity = sim.body_pose.numpy()[0, 0], sim.body_velocity.numpy()[0, 0]
+    assert first[0] == pytest.approx(3.0 * 9.81 * 2.0, rel=1e-2)
+    assert last[0] == pytest.approx(0.5 * 3.0 * velocity[:3] @ velocity[:3] + 3.0 * 9.81 * pose[2], rel=1e-8)
+    assert np.linalg.norm(velocity[:3]) > 0.4  # so that both are seen
+
+
 def test_not_ok_is_logged_once_and_not_missed_between_frames(tmp_path):
     """A bounce that was reduced is counted, but nothing to warn of."""
     path = tmp_path / "run.rrd"

@@ -173,3 +173,14 @@ def test_hips_of_the_gym_ant_turn(shared):
     assert sim.contacts.count.numpy()[0] == 0
     # Armature 1 kg m^2 and damping 1 N m s, beside which the legs weigh nothing.
     assert sim.v.numpy()[0, hips] == pytest.approx(0.3 * (1.0 - math.exp(-0.2)), rel=0.05)
+
+
+def test_numbers_are_the_decimals_that_were_written():
+    """USD keeps single precision, in which 0.1 reads 0.1000000015: bodies would be moved by that to where joints let them."""
+    frames = "point3f physics:localPos0 = (0.1, 0, 0); point3f physics:localPos1 = (-0.1, 0.7, 0); float physics:upperLimit = 0.3;"
+    drive = "float drive:linear:physics:stiffness = 0.9; float drive:linear:physics:maxForce = 0.6;"
+    model = load(*pair("Prismatic", frames + "float physics:lowerLimit = -0.7;" + drive, ("PhysicsDriveAPI:linear",)))
+    assert model.joint_pose[1, :3].tolist() == [0.1, 0, 0]
+    assert model.joint_child_pose[1, :3].tolist() == [-0.1, 0.7, 0]
+    assert model.limit[6].tolist() == [-0.7, 0.3]
+    assert model.drive[6, [0, 2]].tolist() == [0.9, 0.6]

@@ -146,11 +146,12 @@ def describe(reading: SceneReading, law: Law | None = None) -> dict[str, Any]:
     facts: dict[str, Any] = {"scene": reading.source, "simulable": model is not None, "obstacle": obstacle}
     facts |= {"bodies": [{"name": n, "joint": None, "mass": None, "dofs": None} for n in reading.bodies], "joints": list(reading.joints)}
     facts |= {"dofs": None, "shapes": [{"name": n, "type": None, "body": None} for n in reading.shapes], "pairs": None}
-    facts |= {"contact_slots": None, "max_contacts": None, "largest_lcp": None, "bytes_per_env": None, "kernels": None}
+    facts |= {"contact_slots": None, "max_contacts": None, "joint_rows": None, "largest_lcp": None, "bytes_per_env": None, "kernels": None}
     if model is not None:
         facts |= _model_facts(model, law or Law())
     facts["friction"] = (law or Law()).friction
-    facts |= {"mass": reading.mass, "gravity": list(reading.gravity), "up_axis": reading.up_axis}
+    mass = reading.mass if model is None else float(model.mass[model.movable[:-1]].sum())  # less what joints hold to the world
+    facts |= {"mass": mass, "gravity": list(reading.gravity), "up_axis": reading.up_axis}
     facts |= {"meters_per_unit": reading.meters_per_unit, "kilograms_per_unit": reading.kilograms_per_unit}
     facts |= {"notes": list(report.notes), "ignored": [asdict(i) for i in report.ignored]}
     return facts | {"unsupported": [asdict(i) for i in report.unsupported]}
@@ -173,17 +174,20 @@ def _model_facts(model: Model, law: Law) -> dict[str, Any]:
 
 
 def ledger(model: Model, law: Law | None = None) -> dict[str, Any]:
-    """What a model takes under a contact law: degrees of freedom, contact slots, contacts and unknowns of the LCP at most
-    (None where the law is none), bytes of one more environment, names of the kernels."""
+    """What a model takes under a contact law: degrees of freedom, contact slots, contacts, rows of joints and unknowns of the LCP
+    at most (None where the law is none), bytes of one more environment, names of the kernels."""
+    from . import articulation
     from .methods import LCP_UNKNOWNS
     from .simulator import kernel_names
 
     law = law or Law()
+    joint_rows = len(articulation.rows(model)) if model.articulated else 0
     return {
         "dofs": model.dofs,
         "contact_slots": model.num_slots,
         "max_contacts": model.max_contacts,
-        "largest_lcp": None if law.is_cone else min(model.max_contacts, LCP_UNKNOWNS // law.unknowns) * law.unknowns,
+        "joint_rows": joint_rows,
+        "largest_lcp": None if law.is_cone else min(model.max_contacts + joint_rows, LCP_UNKNOWNS // law.unknowns) * law.unknowns,
         "bytes_per_env": bytes_per_env(model, law),
         "kernels": kernel_names(model, law=law),
     }
@@ -226,9 +230,10 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
 def _shown_lcp(facts: dict[str, Any]) -> str:
     if not facts["simulable"]:
         return "?"
+    rows = f"{facts['max_contacts']} contacts" + (f", {facts['joint_rows']} rows of joints" if facts["joint_rows"] else "")
     if facts["largest_lcp"] is None:
-        return f"none, the cone itself ({facts['max_contacts']} contacts)"
-    return f"{facts['largest_lcp']} unknowns ({facts['max_contacts']} contacts)"
+        return f"none, the cone itself ({rows})"
+    return f"{facts['largest_lcp']} unknowns ({rows})"
 
 
 def _print_info(facts: dict[str, Any]) -> None:

@@ -127,9 +127,9 @@ class RerunLogger:
         self._entities = _entity_paths(model, self._moving)
         self.layout = lay_out(model, pose, velocity, self._moving)
         self._drawn = draw(model, pose[0], self.layout)
-        self._free = model.joint_type == JointType.FREE
-        weight = float(model.mass[self._free].sum()) * (float(np.linalg.norm(model.gravity)) or 9.81)
-        stretch = 2.0 * self.layout.size * math.sqrt(max(1, self._free.sum()))  # many bodies share the weight, each shows its part
+        self._movable = model.movable[:-1]
+        weight = float(model.mass[self._movable].sum()) * (float(np.linalg.norm(model.gravity)) or 9.81)
+        stretch = 2.0 * self.layout.size * math.sqrt(max(1, self._movable.sum()))  # many bodies share the weight, each shows its part
         self.force_scale = stretch / weight if weight else 1.0
         self.longest_arrow = stretch
         self.recording = self._rr.RecordingStream("warp_lcp")
@@ -217,7 +217,10 @@ class RerunLogger:
             self.recording.log(self._entities[shape], self._rr.InstancePoses3D(translations=at, quaternions=turn), static=static)
 
     def _energy(self, pose: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """[n] J, kinetic plus potential energy of the free bodies; potential energy is zero at the origin."""
+        """[n] J, kinetic plus potential energy of the bodies that forces move; potential energy is zero at the origin.
+
+        What drives hold and what armatures carry is not counted.
+        """
         parameters = self.sim.parameters
         mass, com, gravity = (self._parameter(p) for p in (parameters.mass, parameters.com, parameters.gravity))
         height = pose[..., :3] + rotate(pose[..., 3:], com)
@@ -225,7 +228,7 @@ class RerunLogger:
         kinetic = 0.5 * mass * (velocity[..., :3] ** 2).sum(-1)
         kinetic = kinetic + 0.5 * np.einsum("...i,...ij,...j", spin, self._parameter(parameters.inertia), spin)
         potential = -mass * (height * gravity[:, None]).sum(-1)
-        return (kinetic + potential)[:, self._free].sum(-1)
+        return (kinetic + potential)[:, self._movable].sum(-1)
 
     def _log_contacts(self) -> None:
         sim, rr = self.sim, self._rr
@@ -235,8 +238,8 @@ class RerunLogger:
         env, slot = np.nonzero(np.arange(contacts.point.shape[1]) < count[:, None])
         point = self._read(contacts.point)[env, slot] + self.layout.offsets[env]
         force = np.einsum("ci,cij->cj", self._read(contacts.impulse)[env, slot], self._read(contacts.frame)[env, slot]) / sim.dt
-        freed = np.append(self._free, False)[self._read(contacts.bodies)[env, slot]]  # body -1, the world, is the last
-        force[freed[:, 0] & ~freed[:, 1]] *= -1.0
+        moved = np.append(self._movable, False)[self._read(contacts.bodies)[env, slot]]  # body -1, the world, is the last
+        force[moved[:, 0] & ~moved[:, 1]] *= -1.0
         color = STATE_COLORS[self._read(contacts.state)[env, slot]]
         arrow = self.force_scale * force
         length = np.linalg.norm(arrow, axis=-1, keepdims=True)

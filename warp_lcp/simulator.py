@@ -72,9 +72,10 @@ INFORMATIVE = Status.RESTITUTION_REDUCED
 
 @dataclass(frozen=True)
 class Contacts:
-    """Contacts of the last step, at its start position. E environments, R = Model.max_contacts.
+    """Contacts of the last step, at its start position. E environments, R = Model.max_contacts, and room for
+    the rows of joints.
 
-    Entries from ``count`` on are stale.
+    Entries from ``count`` on are stale, or rows of joints.
 
     Attributes:
         count: [E] contacts in each environment.

@@ -39,7 +39,7 @@ from . import hulls
 from .builder import ModelBuilder, capsule_solid, rotation_matrix
 from .errors import MissingExtra, ModelError, SceneError
 from .model import Ignored, JointType, Material, Model, Report, ShapeType
-from .usd_attributes import CONTACT_ATTRIBUTES, SURFACE_VELOCITY, unread
+from .usd_attributes import CONTACT_ATTRIBUTES, SURFACE_VELOCITY, unread, written
 from .usd_joints import JointReader
 from .usd_shapes import Solid, mesh_solid, round_solid
 
@@ -357,7 +357,7 @@ class _Reader:
         direction = np.array(desc.gravityDirection, dtype=float)
         magnitude = self.px.UsdPhysics.Scene(self.stage.GetPrimAtPath(path)).GetGravityMagnitudeAttr().Get()
         earth = magnitude is None or not math.isfinite(magnitude) or magnitude < 0.0
-        return (9.81 if earth else self.length * _written(magnitude)) * direction / np.linalg.norm(direction) + 0.0  # no -0
+        return (9.81 if earth else self.length * written(magnitude)) * direction / np.linalg.norm(direction) + 0.0  # no -0
 
     def _composition_errors(self) -> None:
         for error in self.stage.GetCompositionErrors():
@@ -486,7 +486,7 @@ class _Reader:
         for name in ("physics:mass", "physics:density"):
             value = prim.GetAttribute(name).Get()
             if value is not None and not (math.isfinite(value) and value >= 0.0):
-                raise _Unusable(f"{path}: {name} is {_written(value):g}; it must be finite and greater than zero")
+                raise _Unusable(f"{path}: {name} is {written(value):g}; it must be finite and greater than zero")
 
     def _authored_mass(self, prim: Any) -> dict[str, Any]:
         """What the body prim itself says: mass, com (prim's local space), diagonal, axes; None where unauthored."""
@@ -495,7 +495,7 @@ class _Reader:
             return result
         api = self.px.UsdPhysics.MassAPI(prim)
         mass = api.GetMassAttr()
-        result["mass"] = _written(mass.Get()) or None
+        result["mass"] = written(mass.Get()) or None
         result["zero"] = mass.HasAuthoredValue() and mass.Get() == 0.0 and not api.GetDensityAttr().Get()
         com = _decimals(api.GetCenterOfMassAttr().Get())
         if np.isfinite(com).all():
@@ -712,17 +712,17 @@ class _Reader:
     def _read_material(self, path: Any) -> Material:
         prim = self.stage.GetPrimAtPath(path)
         api = self.px.UsdPhysics.MaterialAPI(prim)
-        static, dynamic = _written(api.GetStaticFrictionAttr().Get()), _written(api.GetDynamicFrictionAttr().Get())
+        static, dynamic = written(api.GetStaticFrictionAttr().Get()), written(api.GetDynamicFrictionAttr().Get())
         if dynamic > static:
             self.notes.append(f"{path}: dynamicFriction {dynamic:g} exceeds staticFriction {static:g}: {dynamic:g} is taken for both")
-        bounce = _written(api.GetRestitutionAttr().Get())
+        bounce = written(api.GetRestitutionAttr().Get())
         material = Material(static_friction=max(static, dynamic), dynamic_friction=dynamic, restitution=bounce)
         for name, field in CONTACT_ATTRIBUTES.items():
             attribute = prim.GetAttribute(name)
             if attribute and attribute.Get() is not None:
                 self.read_attributes.add(attribute.GetPath())
                 unit = self.length if field == "slip_threshold" else self.mass_unit
-                material = replace(material, **{field: unit * _written(attribute.Get())})
+                material = replace(material, **{field: unit * written(attribute.Get())})
         return material
 
     # -- pairs ------------------------------------------------------------------------------------------------------
@@ -842,13 +842,8 @@ class _Reader:
             self._repeat(path, what, "it is no geometry: apply it to the shapes below")
 
 
-def _written(value: float) -> float:
-    """The decimal an author wrote: USD keeps single precision, in which 9.81 reads 9.8100004196."""
-    return float(str(np.float32(value)))
-
-
 def _decimals(values: Any) -> np.ndarray:
-    return np.array([_written(v) for v in values])
+    return np.array([written(v) for v in values])
 
 
 def _some(paths: list[str]) -> str:

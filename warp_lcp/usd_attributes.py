@@ -113,3 +113,8 @@ def _neutral(value: Any) -> bool:
     except (TypeError, ValueError):
         return False
     return not np.any(np.isfinite(numbers) & (numbers != 0.0))
+
+
+def written(value: float) -> float:
+    """The decimal an author wrote: USD keeps single precision, in which 9.81 reads 9.8100004196."""
+    return float(str(np.float32(value)))

@@ -20,6 +20,7 @@ import numpy as np
 from .errors import ModelError
 from .joints import multiply
 from .model import Drive, Ignored, JointType
+from .usd_attributes import written
 
 #: The axes of the parser's degrees of freedom.
 DOFS = {"TransX": "tx", "TransY": "ty", "TransZ": "tz", "RotX": "rx", "RotY": "ry", "RotZ": "rz"}
@@ -76,8 +77,8 @@ class JointReader:
             reader._repeat(path, "physics:breakForce, physics:breakTorque", "joints do not break here")
         options: dict[str, Any] = {"name": str(path), "collide": desc.collisionEnabled, "loop": desc.excludeFromArticulation}
         if kind == "DistanceJoint":
-            least = reader.length * desc.limit.lower if desc.minEnabled else 0.0
-            greatest = reader.length * desc.limit.upper if desc.maxEnabled else math.inf
+            least = reader.length * written(desc.limit.lower) if desc.minEnabled else 0.0
+            greatest = reader.length * written(desc.limit.upper) if desc.maxEnabled else math.inf
             options.pop("loop")
             reader.builder.add_distance(*bodies, least, greatest, parent_frame=frames[0], child_frame=frames[1], **options)
             return
@@ -107,7 +108,7 @@ class JointReader:
             self.reader.notes.append(f"{path}: its lower limit is above its upper one: locked")
         else:
             if desc.limit.enabled:
-                options["limit"] = (unit * desc.limit.lower, unit * desc.limit.upper)
+                options["limit"] = (unit * written(desc.limit.lower), unit * written(desc.limit.upper))
             options["drive"] = self._drive(path, desc.drive, angular)
             options |= self._attributes(prim, "r" if angular else "t")
         self.reader.builder.add_joint(type_, *bodies, parent_frame=frames[0], child_frame=frames[1], **options)
@@ -123,7 +124,7 @@ class JointReader:
                 if limit.lower > limit.upper:
                     free.pop(DOFS[dof])
                 else:
-                    free[DOFS[dof]] = (unit * limit.lower, unit * limit.upper)
+                    free[DOFS[dof]] = (unit * written(limit.lower), unit * written(limit.upper))
         drives: dict[str, Drive | None] = {}
         for dof, drive in _by_axis(desc.jointDrives):
             if dof in DOFS and DOFS[dof] in free:
@@ -150,7 +151,7 @@ class JointReader:
     def _frame(self, position: Any, turn: Any) -> np.ndarray:
         """(x y z qx qy qz qw), m."""
         quat = np.array([*turn.GetImaginary(), turn.GetReal()], dtype=float)
-        return np.r_[self.reader.length * np.array(position, dtype=float), quat / np.linalg.norm(quat)]
+        return np.r_[self.reader.length * np.array([written(x) for x in position]), quat / np.linalg.norm(quat)]
 
     def _gain(self, angular: bool) -> float:
         """Unit of a drive's stiffness or damping."""
@@ -165,10 +166,10 @@ class JointReader:
             raise ModelError(f"{path}: a drive of type acceleration is not supported yet; use type force")
         unit = math.radians(1.0) if angular else reader.length
         force = reader.mass_unit * reader.length ** (2 if angular else 1)
-        limit = force * drive.forceLimit if drive.forceLimit < 1e30 else math.inf
+        limit = force * written(drive.forceLimit) if drive.forceLimit < 1e30 else math.inf
         gain = self._gain(angular)
-        targets = unit * drive.targetPosition, unit * drive.targetVelocity
-        return Drive(gain * drive.stiffness, gain * drive.damping, limit, *targets)
+        targets = unit * written(drive.targetPosition), unit * written(drive.targetVelocity)
+        return Drive(gain * written(drive.stiffness), gain * written(drive.damping), limit, *targets)
 
     def _attributes(self, prim: Any, axes: str) -> dict[str, Any]:
         """Armature, damping and dry friction, for each axis ("t" or "r")."""
@@ -179,7 +180,7 @@ class JointReader:
                 value = attribute.Get() if attribute else None
                 if value:
                     reader.read_attributes.add(attribute.GetPath())
-                    found[what] = [float(value) * self._unit(what, axis == "r") for axis in axes]
+                    found[what] = [written(value) * self._unit(what, axis == "r") for axis in axes]
                     break
         return found
 

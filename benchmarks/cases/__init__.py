@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import argparse
 
-from . import impacts, resting, rolling, sliding
+from . import impacts, jointed, resting, rolling, sliding
 from .case import Case, Metric
 
-CASES: dict[str, Case] = {case.name: case for room in (sliding, rolling, resting, impacts) for case in room.CASES}
+CASES: dict[str, Case] = {case.name: case for room in (sliding, rolling, resting, impacts, jointed) for case in room.CASES}
 
 
 def case_names(text: str) -> list[str]:

@@ -94,22 +94,29 @@ class Case:
         return motion.simulate(self.scene(h), self.every(h), **options)
 
     def energy_scale(self, scene: Scene) -> np.ndarray:
-        """What it takes to set the bodies moving and to turn them over [J], [E], wherever the origin is."""
+        """What it takes to set the bodies moving and to turn them over, against weight or other forces [J], [E], wherever the origin is."""
         spin = rotate(scene.pose[..., 3:] * [-1, -1, -1, 1], scene.velocity[..., 3:])
         kinetic = 0.5 * (scene.mass * (scene.velocity[..., :3] ** 2).sum(axis=-1) + (scene.inertia * spin**2).sum(axis=-1)).sum(axis=-1)
         gyration = np.sqrt(scene.inertia.sum(axis=1) / (2.0 * scene.mass))
-        return kinetic + (scene.mass * gyration).sum() * np.linalg.norm(scene.gravity)
+        weight = scene.mass * np.linalg.norm(scene.gravity)
+        if scene.wrench is not None:
+            weight = np.maximum(weight, np.linalg.norm(scene.wrench[:, :3], axis=1))
+        return kinetic + (weight * gyration).sum()
 
     def energy_rise(self, moved: Motion) -> float:
         """By what share of the scale the energy was ever above its start; NaN where it is no number.
 
-        Nothing drives a case but gravity and constant forces, whose work is counted.
+        The work of constant forces is counted; 0 where the scene is not passive.
         """
+        if not moved.scene.passive:
+            return 0.0
         energy = moved.energy()
         return float(np.max((energy - energy[0]) / self.energy_scale(moved.scene)))
 
     def rebound(self, moved: Motion) -> float:
         """By what share of the scale the energy ever rose above its lowest so far: what friction has taken does not come back."""
+        if not moved.scene.passive:
+            return 0.0
         energy = moved.energy()
         return float(np.max((energy - np.minimum.accumulate(energy, axis=0)) / self.energy_scale(moved.scene)))
 

@@ -25,7 +25,7 @@ class PeerError(RuntimeError):
 
 
 class Refused(RuntimeError):
-    """A peer cannot do a job; the message is its own."""
+    """A peer cannot do a job; the message is its own, or says that no peer can."""
 
 
 @dataclass
@@ -112,6 +112,8 @@ class Session:
 
     def make(self, variant: str, scene: Scene | Robot, every: int = 1) -> Task:
         """Let the peer simulate a scene once, not timed, with a sample after every so many steps."""
+        if scene.made is not None:
+            raise Refused(f"{self.peer.name}, {scene.name}: joints, belts or two coefficients of friction, which adapters are not told")
         index = next(self.ids)
         state, result = self.work / f"state{index}.npz", self.work / f"result{index}.npz"
         scene.save(state)
