@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import warp as wp
-from warp_lcp.kernels import contact_problem, lcp, record, solve_batch, watch
+from warp_lcp.kernels import contact_problem, lcp, record, solve_batch, tree, watch
 
 import warp_lcp as wl
 from warp_lcp.methods import LCP_METHODS, METHODS
@@ -50,6 +50,8 @@ def scenes() -> list[wl.Model]:
         many.add_box(many.add_body(), (0.1, 0.1, 0.1))
         many.add_sphere(many.add_body(), 0.1)
         many.add_capsule(many.add_body(), 0.1, 0.1)
+        many.add_cylinder(many.add_body(), 0.1, 0.1)
+    many.add_mesh(-1, [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
     joints = wl.ModelBuilder()
     joints.add_plane(material=wl.Material(restitution=0.5))
     joints.add_box(joints.add_body(), (0.1, 0.1, 0.1))
@@ -65,6 +67,7 @@ def kernels(precision: str) -> dict[str, wp.Kernel]:
     real = PRECISIONS[precision][0]
     found = {"collect_status": watch.collect_status, "solve_contacts": contact_problem.make(real)}
     found |= {name: part for name, part in vars(record.make(real)).items() if isinstance(part, wp.Kernel)}
+    found["dynamics"] = tree.make(real).dynamics
     found |= {f"solve_batch[{method}]": solve_batch.make(real, method) for method in solve_batch.SOLVERS}
     found |= {f"assembled_lcp[{method}]": lcp.make(real, method) for method in ("lemke", "murty", "judice_pires")}
     generators = ("lemke", "murty", "judice_pires")

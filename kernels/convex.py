@@ -145,7 +145,15 @@ def meeting(real):
     t = scalar_types(real)
     vec3, mat33, transform = t.vec3, t.mat33, t.transform
     a, s, c = axes(real), functions(real), clipping(real)
-    rank, Hulls, support, part, face_towards, face_normal = a.rank, s.Hulls, s.support, s.part, s.face_towards, s.face_normal
+    rank, Hulls, Axis, support, part, face_towards, face_normal = (
+        a.rank,
+        s.Hulls,
+        s.Axis,
+        s.support,
+        s.part,
+        s.face_towards,
+        s.face_normal,
+    )
     turned, turned_to, sides, side_plane, clip, spread = s.turned, s.turned_to, s.sides, s.side_plane, c.clip, c.spread
     unseamed = c.unseamed
 
@@ -196,9 +204,16 @@ def meeting(real):
         smallest = wp.min(smallest_size(hulls, a, size_a), smallest_size(hulls, b, size_b))
         touching = wp.clamp(deep[1], deep[0] * smallest, deep[2] * smallest)
         # As of two boxes: axes are compared where the shapes would be after the step, but first those that part them now.
-        best = part(hulls, a, b, size_a, size_b, d, turn, move, scale)
-        if best.separation < -touching:
-            best = part(hulls, a, b, size_a, size_b, d, turn, vec3(), scale)
+        best = Axis()
+        rounds = int(0)  # one call in a loop: a second copy of it is half the kernel
+        while rounds < 2:
+            if rounds == 1:
+                move = vec3()
+            best = part(hulls, a, b, size_a, size_b, d, turn, move, scale)
+            rounds += 1
+            if best.separation >= -touching:
+                rounds = 2
+        move = wp.transpose(axes_a) * motion
         n = best.normal
         far = real(4.0) * (scale + wp.length(move))
         ranked = rank(best.separation, best.separation + wp.dot(n, move), touching, far) - real(1.0e-3) * smallest

@@ -22,7 +22,7 @@ PIECE = wp.constant(8)  # a triangle of a mesh: a hull without thickness
 ROUND = 16
 CORNERS = 8
 # Room for the points and faces of the growing polytope.
-VERTICES = 48
+VERTICES = 32
 FACES = 2 * VERTICES
 # Of the largest size: what a polytope may still grow by.
 FLAT = {wp.float64: 1.0e-11, wp.float32: 1.0e-6}
