@@ -242,6 +242,7 @@ def meeting(real):
         high = half
         low_end = int(0)
         high_end = int(0)
+        seams = int(0)
         least = real(1.0e30)
         looking = bool(True)
         for k in range(number):
@@ -285,6 +286,8 @@ def meeting(real):
                     # What of the core lies over a face, or along a round side.
                     face = face_towards(hulls, b, -way)
                     if -wp.dot(way, face_normal(hulls, b, face)) > real(OVER):
+                        if hulls.kind[b] == PIECE:
+                            seams = hulls.seam[face]
                         for m in range(sides(hulls, b, face)):
                             plane = side_plane(hulls, b, size_b, face, m)
                             n = vec3(plane[0], plane[1], plane[2])
@@ -327,6 +330,11 @@ def meeting(real):
                 features[to] = 1
         if number > 1 and looking and least > wp.min(gaps[0], gaps[1]) - real(wp.static(covered_within(real))) * radius:
             gaps[2] = real(NO_POINT)
+        # Where the surface goes on nothing ends.
+        if low_end > 0 and (seams & (1 << (low_end - 1))) != 0:
+            gaps[0] = real(NO_POINT)
+        if high_end > 0 and (seams & (1 << (high_end - 1))) != 0:
+            gaps[1] = real(NO_POINT)
 
     return meet
 
