@@ -16,6 +16,7 @@ is no row but a part of M (kernels/tree.py).
 """
 
 import functools
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -36,34 +37,15 @@ IMMOBILE = wp.constant(1.0e-10)
 
 
 @functools.cache
-def make(real):
-    """Kernel ``joint_rows``; launch with dim (E), after the contacts' rows."""
+def functions(real) -> SimpleNamespace:
+    """``loop_error``: what a joint that closes a loop holds, and by how much it is apart."""
     t = scalar_types(real)
-    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
-    Bodies, Contacts = t.Bodies, t.Contacts
-    forest = tree.functions(real)
-    Trees, divide, halve, product = forest.Trees, forest.divide, forest.halve, forest.product
+    vec3, mat33, transform = t.vec3, t.mat33, t.transform
 
     @wp.func
     def axis_of(turn: mat33, k: int) -> vec3:
         """Column k of a rotation: where it carries axis k."""
         return vec3(turn[0, k], turn[1, k], turn[2, k])
-
-    @wp.func
-    def spring(phi: real, h: real, w: real, damping: real):
-        """Relaxation and shift of a row that holds phi [m] at zero, w = J M^-1 J^T (eqs. 40 and 41)."""
-        k = real(STIFFNESS)
-        eps = w / (h * (h * k + damping))
-        d = k * phi / (h * k + damping)
-        return eps, wp.clamp(d, -real(MAX_CORRECTION), real(MAX_CORRECTION))
-
-    @wp.func
-    def stop(phi: real, h: real, w: real):
-        """The same for a row that phi may leave: until it is reached u + phi / h >= 0."""
-        eps, d = spring(phi, h, w, real(DAMPING))
-        if phi > real(0.0):
-            d = phi / h
-        return eps, d
 
     @wp.func
     def turn_error(a: mat33, b: mat33, held: wp.vec3i):
@@ -105,6 +87,53 @@ def make(real):
             for c in range(3):
                 frame[one, c] = axis[c] / size
         return frame, angle
+
+    @wp.func
+    def loop_error(kind: int, pose_a: transform, pose_b: transform, held: wp.vec3i, length: real):
+        """Rows of a loop's three ways, or turns, in world axes, those of turns times a length, and how far each is off [m]."""
+        a = wp.quat_to_matrix(wp.transform_get_rotation(pose_a))
+        frame = mat33()
+        phi = vec3()
+        if kind == LOOP_WAY:
+            for r in range(3):
+                if held[r] != 0:
+                    for c in range(3):
+                        frame[r, c] = a[c, r]
+            phi = frame * (wp.transform_get_translation(pose_b) - wp.transform_get_translation(pose_a))
+        elif kind == LOOP_TURN:
+            axes, angle = turn_error(a, wp.quat_to_matrix(wp.transform_get_rotation(pose_b)), held)
+            frame = length * axes
+            phi = length * angle
+        return frame, phi
+
+    return SimpleNamespace(loop_error=loop_error)
+
+
+@functools.cache
+def make(real):
+    """Kernel ``joint_rows``; launch with dim (E), after the contacts' rows."""
+    t = scalar_types(real)
+    vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
+    Bodies, Contacts = t.Bodies, t.Contacts
+    forest = tree.functions(real)
+    Trees, divide, halve, product = forest.Trees, forest.divide, forest.halve, forest.product
+    loop_error = functions(real).loop_error
+
+    @wp.func
+    def spring(phi: real, h: real, w: real, damping: real):
+        """Relaxation and shift of a row that holds phi [m] at zero, w = J M^-1 J^T (eqs. 40 and 41)."""
+        k = real(STIFFNESS)
+        eps = w / (h * (h * k + damping))
+        d = k * phi / (h * k + damping)
+        return eps, wp.clamp(d, -real(MAX_CORRECTION), real(MAX_CORRECTION))
+
+    @wp.func
+    def stop(phi: real, h: real, w: real):
+        """The same for a row that phi may leave: until it is reached u + phi / h >= 0."""
+        eps, d = spring(phi, h, w, real(DAMPING))
+        if phi > real(0.0):
+            d = phi / h
+        return eps, d
 
     @wp.func
     def write(
@@ -234,26 +263,12 @@ def make(real):
                         pose_a = bodies.pose[env, pair[0]] * pose_a
                     if pair[1] >= 0:
                         pose_b = bodies.pose[env, pair[1]] * pose_b
-                    a = wp.quat_to_matrix(wp.transform_get_rotation(pose_a))
-                    b = wp.quat_to_matrix(wp.transform_get_rotation(pose_b))
                     point = wp.transform_get_translation(pose_b)
-                    apart = point - wp.transform_get_translation(pose_a)
-                    held = trees.row_held[k]
-                    frame = mat33()
-                    phi = vec3()
+                    frame, phi = loop_error(kind, pose_a, pose_b, trees.row_held[k], trees.row_length[k])
                     directions = int(HELD)
                     needed = bool(True)
-                    if kind == LOOP_WAY:
-                        for r in range(3):
-                            if held[r] != 0:
-                                for c in range(3):
-                                    frame[r, c] = a[c, r]
-                        phi = frame * apart
-                    elif kind == LOOP_TURN:
-                        axes, angle = turn_error(a, b, held)
-                        frame = trees.row_length[k] * axes
-                        phi = trees.row_length[k] * angle
-                    else:
+                    if kind != LOOP_WAY and kind != LOOP_TURN:
+                        apart = point - wp.transform_get_translation(pose_a)
                         directions = 0
                         distance = wp.length(apart)
                         away = real(-1.0)

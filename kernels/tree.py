@@ -345,6 +345,50 @@ def functions(real) -> SimpleNamespace:
 
 
 @functools.cache
+def motion(real):
+    """Function ``advance``: q+ = q + h Gamma(q) v of the joint above one body."""
+    t = scalar_types(real)
+    vec3, quat = t.vec3, t.quat
+    Bodies, Topology = t.Bodies, t.Topology
+    Trees = functions(real).Trees
+    rotation_by, moved = rigid.functions(real).rotation_by, rigid.functions(real).moved
+
+    @wp.func
+    def advance(
+        topology: Topology,
+        trees: Trees,
+        bodies: Bodies,
+        v: wp.array2d(dtype=real),
+        h: real,
+        q: wp.array2d(dtype=real),
+        env: int,
+        b: int,
+    ):
+        i_q = topology.q_start[b]
+        first = trees.first[b]
+        kind = topology.joint_type[b]
+        if kind == FREE_JOINT or kind == KINEMATIC:  # noqa: SIM109
+            linear = vec3(v[env, first], v[env, first + 1], v[env, first + 2])
+            turn = rotation_by(vec3(v[env, first + 3], v[env, first + 4], v[env, first + 5]), h)
+            pose = moved(bodies.pose[env, b], bodies.com[env, b], linear, turn, h)
+            for k in range(7):
+                q[env, i_q + k] = pose[k]
+        else:
+            for i in range(first, trees.end[b]):
+                if trees.kind[i] == BALL:
+                    turn = quat(q[env, i_q], q[env, i_q + 1], q[env, i_q + 2], q[env, i_q + 3])
+                    turn = wp.normalize(turn * rotation_by(vec3(v[env, i], v[env, i + 1], v[env, i + 2]), h))
+                    for k in range(4):
+                        q[env, i_q + k] = turn[k]
+                    i_q += 4
+                elif trees.kind[i] != BALL_ON:
+                    q[env, i_q] = q[env, i_q] + h * v[env, i]
+                    i_q += 1
+
+    return advance
+
+
+@functools.cache
 def make(real) -> SimpleNamespace:
     """Kernels of scenes with joints; ``dynamics`` of any scene. Launch with dim (E)."""
     t = scalar_types(real)
@@ -353,7 +397,7 @@ def make(real) -> SimpleNamespace:
     f = functions(real)
     Trees, factorise, solve = f.Trees, f.factorise, f.solve
     pair, moved_by, twists = f.pair, f.moved_by, f.twists
-    rotation_by, moved = rigid.functions(real).rotation_by, rigid.functions(real).moved
+    advance = motion(real)
     settled = real(1.0e-10) if real is wp.float64 else real(1.0e-6)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
@@ -729,28 +773,9 @@ def make(real) -> SimpleNamespace:
         """v+ = v_free + M^-1 J^T p and q+ = q + h Gamma(q) v+ (eq. 23)."""
         start, b = wp.tid()
         for env in range(start, q.shape[0], stride):
-            i_q = topology.q_start[b]
-            first = trees.first[b]
-            kind = topology.joint_type[b]
-            for i in range(first, trees.end[b]):
+            for i in range(trees.first[b], trees.end[b]):
                 v[env, i] = trees.free[env, i] + trees.change[env, i]
-            if kind == FREE_JOINT or kind == KINEMATIC:  # noqa: SIM109
-                linear = vec3(v[env, first], v[env, first + 1], v[env, first + 2])
-                turn = rotation_by(vec3(v[env, first + 3], v[env, first + 4], v[env, first + 5]), h)
-                pose = moved(bodies.pose[env, b], bodies.com[env, b], linear, turn, h)
-                for k in range(7):
-                    q[env, i_q + k] = pose[k]
-            else:
-                for i in range(first, trees.end[b]):
-                    if trees.kind[i] == BALL:
-                        turn = quat(q[env, i_q], q[env, i_q + 1], q[env, i_q + 2], q[env, i_q + 3])
-                        turn = wp.normalize(turn * rotation_by(vec3(v[env, i], v[env, i + 1], v[env, i + 2]), h))
-                        for k in range(4):
-                            q[env, i_q + k] = turn[k]
-                        i_q += 4
-                    elif trees.kind[i] != BALL_ON:
-                        q[env, i_q] = q[env, i_q] + h * v[env, i]
-                        i_q += 1
+            advance(topology, trees, bodies, v, h, q, env, b)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def reset_control(mask: wp.array(dtype=wp.bool), target: wp.array(dtype=real), rate: wp.array(dtype=real), trees: Trees):

@@ -27,6 +27,7 @@ from .kernels import (
     integrate,
     joint_rows,
     mesh,
+    projection,
     reset,
     restitution,
     rounded,
@@ -132,6 +133,8 @@ class Simulator:
         integrator: 'euler', q+ = q + h Gamma v+ (eq. 23), or 'midpoint', q+ = q + h Gamma (v + v+) / 2 but for bodies that
             this would drive into others: second order away from impacts.
         device: Warp device; None = Warp's default.
+        project_loops: bring joints that close loops back together after each step. Without it they are apart by what a step of Euler's
+            rule opens them, of second order in dt, which does not grow.
         strict: raise after a step in which an environment's status is not OK (reads the status back every time);
             RESTITUTION_REDUCED alone does not count.
 
@@ -165,6 +168,7 @@ class Simulator:
         integrator: str = "euler",
         device: Any = None,
         strict: bool = False,
+        project_loops: bool = False,
     ):
         self.law = Law(formulation, sliding, directions)
         _choice("method", method, tuple(METHODS))
@@ -175,6 +179,7 @@ class Simulator:
         self.model, self.num_envs, self.dt = model, whole_number("num_envs", num_envs, 1), positive_number("dt", dt, "s")
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
+        self.project_loops = bool(project_loops) and any(loop.distance is None for loop in model.loops)
         self.directions, self.rho_scale, self.strict = self.law.directions, positive_number("rho_scale", rho_scale), bool(strict)
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
@@ -455,6 +460,10 @@ class Simulator:
         else:
             self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
         self._refresh_bodies()
+        if self.project_loops:
+            for _ in range(projection.ROUNDS):
+                self.launch(k.project, [self.topology, self.mechanics, self.bodies, self.rows, *self._loop_system, self.q, self.v, h])
+                self._refresh_bodies()
 
     def _solve_kernels(self, todo: wp.array, number: wp.array, status: wp.array) -> None:
         """The environments todo[:number] by the first method, those left by the next, and so on; each answer certified."""
@@ -609,8 +618,13 @@ class Simulator:
         self.residual, self.residual_energy, self.best_residual = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(3))
 
     def _load_kernels(self) -> None:
+        if self.project_loops:
+            n = 3 * sum(row.kind in (tree.LOOP_WAY, tree.LOOP_TURN) for row in articulation.rows(self.model))
+            self._loop_system = (wp.zeros((self.num_envs, n, n), dtype=self.real, device=self.device), self._array(n, self.real))
         self._methods = [method(self.model, self.real, self.law) for method in chosen(self.method, self.precision, self.law)]
         self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator, self._methods[0].makes_rows)
+        if self.project_loops:
+            self._kernels.project = projection.make(self.real)
         for method in self._methods[1:]:
             method.take_rows()
         for method in self._methods:
