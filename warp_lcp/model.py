@@ -334,6 +334,11 @@ class Model:
         return int(np.count_nonzero(self.dof_kind != DofKind.PRESCRIBED))
 
     @property
+    def gains(self) -> np.ndarray:
+        """[nv, 3] stiffness, damping and greatest force of the drives."""
+        return self.drive[:, :3]
+
+    @property
     def articulated(self) -> bool:
         """Does a body move on another one, or on a joint on the world?"""
         return bool((self.joint_type > JointType.FIXED).any() or (self.body_parent >= 0).any() or self.loops)

@@ -50,7 +50,13 @@ PARAMETERS = {
     "contact": "it must be finite and not negative (damping and slip threshold greater than zero), or NaN for Table 1",
     "restitution": "it must be at least 0 and at most 1",
     "gravity": "it must be finite",
+    "armature": "it must be finite and not negative",
+    "damping": "it must be finite and not negative",
+    "joint_friction": "it must be finite and not negative, and zero where the model has neither dry friction, a lower limit nor a drive",
+    "gains": "they must be finite and not negative, the greatest force infinite just where the model's is, and zero without a drive",
 }
+#: Those of joints: a model without has none.
+JOINT_PARAMETERS = ("armature", "damping", "joint_friction", "gains")
 #: Largest residual [m/s] of an answer that counts as solved.
 TOLERANCE = 1e-6
 
@@ -267,8 +273,9 @@ class Simulator:
 
         Each value has the shape of the Model's field, or that with num_envs in front: ``mass`` [B], ``inertia``
         [B, 3, 3] about the centre of mass in body axes, ``com`` [B, 3], ``friction`` [S, 2] (static, dynamic),
-        ``contact`` [S, 5] (k_n, b_n, k_t, b_t, v_s; NaN = Table 1 scaled with the mass), ``restitution`` [S] and ``gravity``
-        [3]. SI units.
+        ``contact`` [S, 5] (k_n, b_n, k_t, b_t, v_s; NaN = Table 1 scaled with the mass), ``restitution`` [S], ``gravity``
+        [3]; of joints ``armature`` [nv], ``damping`` [nv], ``joint_friction`` [nv] and ``gains`` [nv, 3] (stiffness, damping and greatest
+        force of the drives). SI units.
 
         What follows from a parameter follows at once: inverse masses, the scaling of Table 1, the coefficients of a
         pair. ``mass`` without ``inertia`` is a body of the same shape and another density: its inertia scales along.
@@ -280,11 +287,15 @@ class Simulator:
         checked = {name: self._checked_parameter(name, value) for name, value in values.items()}
         if "mass" in checked and "inertia" not in checked:
             inertia, mass = self.parameters.inertia.numpy(), self.parameters.mass.numpy()
-            checked["inertia"] = inertia * (checked["mass"] / mass)[..., None, None]
+            checked["inertia"] = inertia * (checked["mass"] / np.where(mass > 0.0, mass, 1.0))[..., None, None]
         if "restitution" in checked:
             self._set_restitution(checked.pop("restitution"))
         for name, value in checked.items():
-            self._set_constant(self.parameters, name, value)
+            if name in JOINT_PARAMETERS:
+                for field, numbers in articulation.parameter(self.model, name, value):
+                    self._set_constant(self.mechanics, field, numbers)
+            else:
+                self._set_constant(self.parameters, name, value)
         self._combine_pairs()
 
     def _combine_pairs(self) -> None:
@@ -333,6 +344,8 @@ class Simulator:
     def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
         if name not in PARAMETERS:
             raise WarpLcpError(f"set_parameters: {name!r} is not a parameter; choose from {', '.join(PARAMETERS)}")
+        if name in JOINT_PARAMETERS and not self.model.articulated:
+            raise WarpLcpError(f"set_parameters: {name!r} is of joints, and the model has none")
         array = np.asarray(value.numpy() if isinstance(value, wp.array) else value, dtype=float)
         shape = getattr(self.model, name).shape
         if array.shape == shape:
@@ -341,7 +354,9 @@ class Simulator:
             raise WarpLcpError(f"set_parameters: {name} has shape {array.shape}; give {shape} or {(self.num_envs, *shape)}")
         allowed: np.ndarray = np.isfinite(array) | (np.isnan(array) & (name == "contact"))
         if name == "mass":
-            allowed &= array > 0.0
+            allowed &= (array > 0.0) | ((array == 0.0) & (self.model.mass == 0.0))  # of what is welded to others
+        elif name in JOINT_PARAMETERS:
+            allowed = articulation.possible(self.model, name, array)
         elif name == "restitution":
             allowed &= (array >= 0.0) & (array <= 1.0)
         elif name == "friction":
@@ -352,7 +367,9 @@ class Simulator:
             allowed[..., [1, 3, 4]] &= array[..., [1, 3, 4]] != 0.0
         elif name == "inertia" and allowed.all():
             moments = np.linalg.eigvalsh(array)
-            possible = (moments[..., 0] > 0.0) & (moments[..., 2] <= (moments[..., 0] + moments[..., 1]) * (1 + 1e-6))
+            possible = ((moments[..., 0] > 0.0) | (self.model.mass == 0.0)) & (
+                moments[..., 2] <= (moments[..., 0] + moments[..., 1]) * (1 + 1e-6)
+            )
             possible &= np.isclose(array, np.swapaxes(array, -1, -2), rtol=1e-6, atol=0.0).all(axis=(-1, -2))
             allowed &= possible[..., None, None]
         if not allowed.all():
