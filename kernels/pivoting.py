@@ -262,6 +262,7 @@ def make(real, cone: bool, frozen: bool, trees: bool = False) -> SimpleNamespace
     system = systems.trees(real) if trees else systems.bodies(real)
     Mechanics, Workspace, list_contacts, couple = system.Mechanics, system.Workspace, system.list_contacts, system.couple
     assemble_row, change_at, energies = system.assemble_row, system.change_at, system.energies
+    prepare = system.prepare if trees else None
 
     @wp.func
     def tangent(frame: mat33, relaxed: vec3, stiffness: vec3, mu: vec2, bound: vec2, k: int, follows: real):
@@ -384,6 +385,8 @@ def make(real, cone: bool, frozen: bool, trees: bool = False) -> SimpleNamespace
             solves = int(0)
             searching = r > 0
             if searching:
+                if wp.static(trees):
+                    prepare(ws, mechanics, contacts.body, env, slot, r, lane)
                 list_contacts(ws, contacts.body, env, slot, r, lane)
                 searching = couple(g, ws, contacts.body, env, slot, lane)
             stopped = r > 0 and not searching

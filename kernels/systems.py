@@ -17,12 +17,13 @@ from .types import scalar_types, sync
 
 
 @functools.cache
-def shared(real) -> SimpleNamespace:
+def shared(real, of_trees: bool = False) -> SimpleNamespace:
     """Bundle ``Workspace`` and what both systems do with it."""
     t = scalar_types(real)
     vec3, mat33 = t.vec3, t.mat33
     vec6 = wp.types.vector(length=6, dtype=real)
     mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
+    mat63 = wp.types.matrix(shape=(6, 3), dtype=real)
     s = sparse.functions(real, 6)
     Graph, clear, connect, analyse = s.Graph, s.clear, s.connect, s.analyse
 
@@ -33,6 +34,8 @@ def shared(real) -> SimpleNamespace:
         nodes: wp.array2d(dtype=int)  # [B, m] nodes that a body's motion is made of, -1 behind the last one
         body: wp.array(dtype=int)  # [n] of free bodies: whose node it is
         velocity: wp.array2d(dtype=int)  # [n, 6] of trees: which velocities are in a node, -1 where there is none
+        node: wp.array2d(dtype=int)  # [P, 2 m R] of trees: the nodes of each contact, each once, -1 where there is none...
+        arm: wp.array2d(dtype=mat63)  # ... and J^T of the contact in their unknowns, world axes
         begin: wp.array2d(dtype=int)  # [P, n + 1] first contact of each node in `contact`
         contact: wp.array2d(dtype=int)  # [P, 2 m R]
         matrix: wp.array2d(dtype=mat33)  # [P, R] K
@@ -65,6 +68,13 @@ def shared(real) -> SimpleNamespace:
         return result
 
     @wp.func
+    def node_of(ws: Workspace, body: wp.array2d(dtype=wp.vec2i), env: int, slot: int, i: int, k: int) -> int:
+        """The same of contact i; of trees it has been written down."""
+        if wp.static(of_trees):
+            return ws.node[slot, 2 * ws.nodes.shape[1] * i + k]
+        return touched(ws.nodes, body[env, i], k)
+
+    @wp.func
     def list_contacts(ws: Workspace, body: wp.array2d(dtype=wp.vec2i), env: int, slot: int, r: int, lane: int):
         """Contacts of each node, in order."""
         if lane == 0:
@@ -74,14 +84,14 @@ def shared(real) -> SimpleNamespace:
                 ws.begin[slot, b] = 0
             for i in range(r):
                 for k in range(sides):
-                    b = touched(ws.nodes, body[env, i], k)
+                    b = node_of(ws, body, env, slot, i, k)
                     if b >= 0:
                         ws.begin[slot, b + 1] = ws.begin[slot, b + 1] + 1
             for b in range(n):
                 ws.begin[slot, b + 1] = ws.begin[slot, b + 1] + ws.begin[slot, b]
             for i in range(r):
                 for k in range(sides):
-                    b = touched(ws.nodes, body[env, i], k)
+                    b = node_of(ws, body, env, slot, i, k)
                     if b >= 0:
                         e = ws.begin[slot, b]
                         ws.contact[slot, e] = i
@@ -99,9 +109,9 @@ def shared(real) -> SimpleNamespace:
         for b in range(lane, n, wp.block_dim()):
             clear(g, slot, n, b)
             for e in range(ws.begin[slot, b], ws.begin[slot, b + 1]):
-                pair = body[env, ws.contact[slot, e]]
+                i = ws.contact[slot, e]
                 for k in range(2 * ws.nodes.shape[1]):
-                    other = touched(ws.nodes, pair, k)
+                    other = node_of(ws, body, env, slot, i, k)
                     if other >= 0 and other != b:
                         connect(g, slot, b, other)
         sync()
@@ -249,26 +259,33 @@ def trees(real) -> SimpleNamespace:
     """Of kinematic trees."""
     t = scalar_types(real)
     vec2, vec3 = t.vec2, t.vec3
-    s = shared(real)
+    s = shared(real, True)
     Graph, Workspace, add_block, touched = s.Graph, s.Workspace, s.add_block, s.touched
     mat63 = wp.types.matrix(shape=(6, 3), dtype=real)
     Trees = tree.functions(real).Trees
 
     @wp.func
-    def entries(ws: Workspace, m: Trees, pair: wp.vec2i, env: int, i: int, b: int) -> mat63:
-        """J^T of contact i in the unknowns of node b, world axes."""
-        g = mat63()
-        for side in range(2):
-            body = pair[side]
-            if body >= 0:
-                for c in range(6):
-                    v = ws.velocity[b, c]
-                    if v >= 0:  # noqa: SIM102
-                        if m.path[body, m.depth[v]] == v:
-                            y = m.half[env, (2 * i + side) * m.longest + m.depth[v]]
-                            for k in range(3):
-                                g[c, k] = g[c, k] + real(2 * side - 1) * y[k]
-        return g
+    def prepare(ws: Workspace, m: Trees, body: wp.array2d(dtype=wp.vec2i), env: int, slot: int, r: int, lane: int):
+        """The nodes of each contact and its J^T in their unknowns."""
+        sides = 2 * ws.nodes.shape[1]
+        for i in range(lane, r, wp.block_dim()):
+            pair = body[env, i]
+            for k in range(sides):
+                b = touched(ws.nodes, pair, k)
+                ws.node[slot, i * sides + k] = b
+                if b >= 0:
+                    arm = mat63()
+                    for side in range(2):
+                        if pair[side] >= 0:
+                            for c in range(6):
+                                v = ws.velocity[b, c]
+                                if v >= 0:  # noqa: SIM102
+                                    if m.path[pair[side], m.depth[v]] == v:
+                                        y = real(2 * side - 1) * m.half[env, (2 * i + side) * m.longest + m.depth[v]]
+                                        for d in range(3):
+                                            arm[c, d] = arm[c, d] + y[d]
+                    ws.arm[slot, i * sides + k] = arm
+        sync()
 
     @wp.func
     def assemble_row(
@@ -282,19 +299,23 @@ def trees(real) -> SimpleNamespace:
         b: int,
     ):
         """The six rows of one node, in the factors' memory."""
+        sides = 2 * ws.nodes.shape[1]
         diagonal = wp.identity(n=6, dtype=real)
         right = -ws.present[slot, b]
         for e in range(ws.begin[slot, b], ws.begin[slot, b + 1]):
             i = ws.contact[slot, e]
-            pair = body[env, i]
-            own = entries(ws, m, pair, env, i, b)
-            left = own * ws.matrix[slot, i]
-            diagonal += left * wp.transpose(own)
+            first = i * sides
+            at = int(first)
+            while ws.node[slot, at] != b:
+                at += 1
+            own = ws.arm[slot, at]
+            matrix = ws.matrix[slot, i]
+            diagonal += own * (matrix * wp.transpose(own))
             right -= own * ws.shift[slot, i]
-            for k in range(2 * ws.nodes.shape[1]):
-                other = touched(ws.nodes, pair, k)
-                if other >= 0 and other != b:
-                    add_block(g, slot, b, other, left * wp.transpose(entries(ws, m, pair, env, i, other)))
+            for k in range(first, first + sides):
+                other = ws.node[slot, k]
+                if other >= 0 and k != at:
+                    add_block(g, slot, b, other, own * (matrix * wp.transpose(ws.arm[slot, k])))
         g.pivot[slot, g.step[slot, b]] = diagonal
         ws.change[slot, b] = right
 
@@ -303,12 +324,12 @@ def trees(real) -> SimpleNamespace:
         ws: Workspace, m: Trees, body: wp.array2d(dtype=wp.vec2i), point: wp.array2d(dtype=vec3), env: int, slot: int, i: int
     ) -> vec3:
         """J x of contact i, world axes."""
-        pair = body[env, i]
+        sides = 2 * ws.nodes.shape[1]
         u = vec3()
-        for k in range(2 * ws.nodes.shape[1]):
-            b = touched(ws.nodes, pair, k)
+        for k in range(i * sides, (i + 1) * sides):
+            b = ws.node[slot, k]
             if b >= 0:
-                u += wp.transpose(entries(ws, m, pair, env, i, b)) * ws.change[slot, b]
+                u += wp.transpose(ws.arm[slot, k]) * ws.change[slot, b]
         return u
 
     @wp.func
@@ -320,6 +341,7 @@ def trees(real) -> SimpleNamespace:
     return SimpleNamespace(
         Mechanics=Trees,
         Workspace=Workspace,
+        prepare=prepare,
         list_contacts=s.list_contacts,
         couple=s.couple,
         assemble_row=assemble_row,

@@ -210,7 +210,8 @@ class VelocityPivoting(Method):
             nodes[self.movable, 0] = np.arange(len(body))
         n, most = len(body), nodes.shape[1]
         blocks, fill = min(n * (n - 1), self.NEIGHBOURS * n), min(n * (n - 1) // 2, self.FILL * n)
-        self.slots = workspaces(sim.num_envs, 60 * n + blocks + 73 * fill + 28 * contacts, sim.device)
+        arms = 2 * most * contacts if sim.model.articulated else 0
+        self.slots = workspaces(sim.num_envs, 60 * n + blocks + 73 * fill + 28 * contacts + 19 * arms, sim.device)
         self.graph = graph_workspace(sim.real, 6, self.slots, n, blocks, fill, sim.device)
         ws = self.workspace = self.parts.Workspace()
         ws.nodes, ws.body, ws.velocity = sim.ints(nodes), sim.ints(body), sim.ints(velocity)
@@ -218,6 +219,8 @@ class VelocityPivoting(Method):
         for name, width, dtype in (
             ("begin", n + 1, int),
             ("contact", 2 * most * contacts, int),
+            ("node", arms, int),
+            ("arm", arms, wp.types.matrix(shape=(6, 3), dtype=sim.real)),
             ("matrix", contacts, t.mat33),
             ("shift", contacts, t.vec3),
             ("change", n, vec6),
