@@ -148,7 +148,7 @@ def possible(model: Model, name: str, value: np.ndarray) -> np.ndarray:
         has_row = np.isin(np.arange(model.nv), [row.velocity for row in rows(model) if row.kind == int(tree.LIMIT_LOW)])
         allowed = allowed & (has_row | (value == 0.0))
     elif name == "gains":
-        driven, bounded = model.gains[:, :2].any(axis=1), np.isfinite(model.gains[:, 2])
+        driven, bounded = (model.gains[:, :2] > 0.0).sum(axis=1) > 0, np.isfinite(model.gains[:, 2])
         stiff = np.isfinite(value[..., :2]) & (driven[:, None] | (value[..., :2] == 0.0))
         allowed = allowed & np.concatenate([stiff, (np.isfinite(value[..., 2]) == bounded)[..., None]], axis=-1)
     return allowed
