@@ -24,7 +24,7 @@ pytest.importorskip("pxr", reason="needs the extra 'usd'")
 
 ROOT = Path(__file__).resolve().parents[1]
 OPENUSD = ROOT.parent / "shared" / "usd" / "openusd"
-CONE = 'def Cone "Cone" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}'
+ODD = 'def Capsule_1 "Odd" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}'
 PHYSICS = 'def PhysicsScene "Scene" {}\n'
 BOX = """def Cube "Box" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI"])
 {
@@ -162,17 +162,17 @@ def test_info_lists_scenes_made_elsewhere(capsys, scene, bodies):
 
 
 def test_info_lists_what_cannot_be_simulated(capsys, tmp_path):
-    scene = tmp_path / "cone.usda"
+    scene = tmp_path / "odd.usda"
     hinge = 'def PhysicsRevoluteJoint "Hinge" {\nrel physics:body0 = </Box>\n}\n'
-    scene.write_text(HEADER + PHYSICS + BOX % 2 + hinge + CONE)
+    scene.write_text(HEADER + PHYSICS + BOX % 2 + hinge + ODD)
     facts = info(capsys, scene)
     assert (facts["simulable"], facts["dofs"], facts["pairs"], facts["joints"]) == (False, None, None, ["/Hinge"])
     assert facts["bodies"][0]["name"] == "/Box"
-    assert facts["unsupported"][0]["path"] == "/Cone"
+    assert facts["unsupported"][0]["path"] == "/Odd"
     assert main(["info", str(scene)]) == 0
     text = capsys.readouterr().out
     assert "cannot be simulated" in text
-    assert "/Cone" in text
+    assert "/Odd" in text
 
 
 def test_info_lists_joints(capsys, tmp_path):
@@ -320,8 +320,8 @@ def test_scenes_that_run_refuses(capsys, tmp_path):
     scene = tmp_path / "scene.usda"
     scene.write_text(HEADER + PHYSICS + BOX.replace(', "PhysicsCollisionAPI"', "") % 0)
     assert "/Box" in error_line(capsys, "run", scene)  # without mass
-    scene.write_text(HEADER + PHYSICS + BOX % 1 + CONE)
-    assert "/Cone" in error_line(capsys, "run", scene)
+    scene.write_text(HEADER + PHYSICS + BOX % 1 + ODD)
+    assert "/Odd" in error_line(capsys, "run", scene)
     assert "no shipped scene of this name" in error_line(capsys, "run", "box_on_grund")
     assert "did you mean" in error_line(capsys, "info", "box_on_grund")
 

@@ -112,7 +112,7 @@ class Session:
 
     def make(self, variant: str, scene: Scene | Robot, every: int = 1) -> Task:
         """Let the peer simulate a scene once, not timed, with a sample after every so many steps."""
-        if scene.made is not None:
+        if isinstance(scene, Scene) and scene.made is not None:
             raise Refused(f"{self.peer.name}, {scene.name}: joints, belts or two coefficients of friction, which adapters are not told")
         index = next(self.ids)
         state, result = self.work / f"state{index}.npz", self.work / f"result{index}.npz"
