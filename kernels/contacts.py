@@ -28,6 +28,8 @@ ELASTIC_RANGE = wp.constant(10.0)
 GIVEN_BACK = wp.constant(0.5)
 # A predicted slip under this part of the free velocity is round-off and has no direction.
 NO_SLIP = wp.constant(1.0e-6)
+# Friction that was this part of its limit was at it.
+AT_LIMIT = wp.constant(0.999)
 # The last normal impulse that eq. 43 divides by is at least this part of the contact's weight.
 IMPULSE_FLOOR = wp.constant(1.0e-2)
 
@@ -260,6 +262,25 @@ def row_functions(real) -> SimpleNamespace:
         return w
 
     @wp.func
+    def expected(row: Row, touched: bool, u_n: real, impulse: real, carried: vec3) -> int:
+        """What velocity pivoting starts from in a tree, whose joints may make any other motion of a free one; carried: the last friction.
+
+        What hung over another thing without moving is not expected to close, and what was at its limit of friction to stay there.
+        """
+        state = row.state
+        if not touched:
+            if u_n + row.shift[0] >= real(0.0):
+                state = state & ~1
+        elif state == 1 and row.directions == 2:
+            for axis in range(2):
+                limit = real(AT_LIMIT) * row.mu[axis] * impulse
+                if limit > real(0.0) and carried[1 + axis] < -limit:
+                    state = state | (1 << (1 + 2 * axis))
+                elif limit > real(0.0) and carried[1 + axis] > limit:
+                    state = state | (2 << (1 + 2 * axis))
+        return state
+
+    @wp.func
     def read_row(
         topology: Topology,
         parameters: Parameters,
@@ -311,7 +332,12 @@ def row_functions(real) -> SimpleNamespace:
         contacts.state[env, i] = row.state
 
     return SimpleNamespace(
-        contact_parameters=contact_parameters, velocities=velocities, mobility=mobility, read_row=read_row, write_row=write_row
+        contact_parameters=contact_parameters,
+        velocities=velocities,
+        mobility=mobility,
+        expected=expected,
+        read_row=read_row,
+        write_row=write_row,
     )
 
 
@@ -326,7 +352,7 @@ def make(real, trees: bool = False) -> SimpleNamespace:
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     f = row_functions(real)
     contact_parameters, velocities, mobility = f.contact_parameters, f.velocities, f.mobility
-    read_row, write_row = f.read_row, f.write_row
+    expected, read_row, write_row = f.expected, f.read_row, f.write_row
     forest = tree.functions(real)
     halve, product = forest.halve, forest.product
     Mechanics = forest.Trees if trees else Bodies
@@ -522,6 +548,9 @@ def make(real, trees: bool = False) -> SimpleNamespace:
                     w = product(mechanics.shared, mechanics.half, contacts.body, mechanics.longest, env, i, i)
                     row = read_row(topology, parameters, slots, env, slot, wp.dot(n, w * n), u, u_free, h, sliding, directions, frozen)
                     row.inv_mass = wp.get_diag(row.frame * w * wp.transpose(row.frame))
+                    touched = slots.last_feature[env, slot] == slots.feature[env, slot]
+                    carried = h * (row.frame * slots.last_bristle[env, slot])
+                    row.state = expected(row, touched, wp.dot(n, u), slots.last_impulse[env, slot], carried)
                     write_row(contacts, env, i, body, point, slots.gap[env, slot], row)
                 else:
                     w_nn = mobility(mechanics, env, body, point, n)

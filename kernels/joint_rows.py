@@ -116,7 +116,7 @@ def make(real):
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
     Bodies, Contacts = t.Bodies, t.Contacts
     forest = tree.functions(real)
-    Trees, divide, halve, product = forest.Trees, forest.divide, forest.halve, forest.product
+    Trees, divide, product, inertia_along = forest.Trees, forest.divide, forest.product, forest.inertia_along
     loop_error = functions(real).loop_error
 
     @wp.func
@@ -188,34 +188,35 @@ def make(real):
                 i = trees.row_velocity[k]
                 if i >= 0:
                     body = trees.row_owner[k]
-                    length = real(1.0)
-                    if trees.kind[i] != LINEAR:
-                        length = wp.sqrt(trees.matrix[env, trees.row[i]] / trees.mass[env, body])
                     sign = real(1.0)
                     if kind == LIMIT_HIGH:
                         sign = real(-1.0)
                     drive = trees.row_drive[env % trees.row_drive.shape[0], k]
                     friction = trees.row_friction[env % trees.row_friction.shape[0], k]
                     position = q[env, trees.coordinate[i]]
-                    gap = length * sign * (position - trees.row_limit[k])
-                    fastest = length * wp.max(wp.abs(v[env, i]), wp.abs(trees.free[env, i]))
-                    near = gap < real(2.0) * h * fastest + real(1.0e-6) * length
+                    gap = sign * (position - trees.row_limit[k])
+                    near = gap < real(2.0) * h * wp.max(wp.abs(v[env, i]), wp.abs(trees.free[env, i])) + real(1.0e-6)
                     stiff = h * (h * drive[0] + drive[1])
-                    scale = vec3()
-                    if near:
-                        scale[0] = sign * length
-                    if stiff > real(0.0):
-                        scale[1] = length
-                    if friction > real(0.0):
-                        scale[2] = length
-                    if scale[0] != real(0.0) or scale[1] != real(0.0) or scale[2] != real(0.0):
+                    if near or stiff > real(0.0) or friction > real(0.0):
+                        length = real(1.0)
+                        if trees.kind[i] != LINEAR:
+                            length = wp.sqrt(inertia_along(trees, h, env, body, i) / trees.mass[env, body])
+                        scale = vec3()
+                        if near:
+                            scale[0] = sign * length
+                        if stiff > real(0.0):
+                            scale[1] = length
+                        if friction > real(0.0):
+                            scale[2] = length
                         first = (2 * n + 1) * trees.longest
                         j = trees.last[body]
                         while j >= 0:
                             trees.half[env, first + trees.depth[j]] = vec3()
                             j = trees.before[j]
-                        trees.half[env, first + trees.depth[i]] = scale
-                        divide(trees, env, first, body)
+                        taken = trees.taken[env, i]
+                        trees.half[env, first + trees.depth[i]] = trees.scale[env, i] * scale
+                        force = -wp.outer(wp.spatial_top(taken), scale)
+                        divide(trees, env, first, trees.before[i], force, -wp.outer(wp.spatial_bottom(taken), scale))
                         trees.row_scale[env, k] = scale
                         contacts.body[env, n] = wp.vec2i(-1, body)
                         w = wp.get_diag(product(trees.shared, trees.half, contacts.body, trees.longest, env, n, n))
@@ -224,7 +225,7 @@ def make(real):
                         free = trees.free[env, i] * scale
                         state = int(0)
                         if near:
-                            eps_n, d = stop(gap, h, w[0])
+                            eps_n, d = stop(length * gap, h, w[0])
                             eps[0] = eps_n
                             shift[0] = d
                             if free[0] + d < real(0.0):
@@ -299,15 +300,12 @@ def make(real):
                         for side in range(2):
                             body = pair[side]
                             if body >= 0:
-                                if kind == LOOP_TURN:
-                                    first = (2 * n + side) * trees.longest
-                                    j = trees.last[body]
-                                    while j >= 0:
-                                        trees.half[env, first + trees.depth[j]] = trees.angular[env, j]
-                                        j = trees.before[j]
-                                    divide(trees, env, first, body)
-                                else:
-                                    halve(trees, env, 2 * n + side, body, point)
+                                force = mat33()
+                                moment = wp.identity(n=3, dtype=real)
+                                if kind != LOOP_TURN:
+                                    force = wp.identity(n=3, dtype=real)
+                                    moment = wp.skew(point - trees.origin[env, trees.root[body]])
+                                divide(trees, env, (2 * n + side) * trees.longest, trees.last[body], force, moment)
                         contacts.body[env, n] = pair
                         mobility = product(trees.shared, trees.half, contacts.body, trees.longest, env, n, n)
                         w_row = wp.get_diag(frame * mobility * wp.transpose(frame))

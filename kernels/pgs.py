@@ -62,8 +62,8 @@ def make(real, trees: bool = False):
             env = todo[index]
             r = contacts.count[env]
             if wp.static(trees):
-                for k in range(bodies.mean.shape[1]):
-                    bodies.mean[env, k] = real(0.0)
+                for k in range(bodies.change.shape[1]):
+                    bodies.change[env, k] = real(0.0)
             else:
                 for b in range(velocity.shape[1]):
                     velocity[env, b] = bodies.free_velocity[env, b]
@@ -87,7 +87,7 @@ def make(real, trees: bool = False):
 
                     u = vec3()
                     if wp.static(trees):
-                        u = gather(bodies, bodies.mean, env, i, body)
+                        u = gather(bodies, bodies.change, env, i, body)
                     else:
                         u = relative(velocity, bodies.free_velocity, bodies.com, env, body, point)
                     relaxed = free + frame * u + wp.cw_mul(eps, p)
@@ -99,7 +99,7 @@ def make(real, trees: bool = False):
                         p[0] = wp.max(p[0], real(0.0))
                     push = frame[0] * (p[0] - old[0])
                     if wp.static(trees):
-                        scatter(bodies, bodies.mean, env, i, body, push)
+                        scatter(bodies, bodies.change, env, i, body, push)
                     else:
                         for side in range(2):
                             b = body[side]
@@ -109,7 +109,7 @@ def make(real, trees: bool = False):
                                 velocity[env, b] += response(bodies.inv_mass[env, b], bodies.inv_inertia[env, b], wrench(arm, sign * push))
                     if k != 0:
                         if wp.static(trees):
-                            u = gather(bodies, bodies.mean, env, i, body)
+                            u = gather(bodies, bodies.change, env, i, body)
                         else:
                             u = relative(velocity, bodies.free_velocity, bodies.com, env, body, point)
                         relaxed = free + frame * u + wp.cw_mul(eps, p)
@@ -119,7 +119,7 @@ def make(real, trees: bool = False):
                         p = vec3(p[0], x[0], x[1])
                         push = frame[1] * (p[1] - old[1]) + frame[2] * (p[2] - old[2])
                         if wp.static(trees):
-                            scatter(bodies, bodies.mean, env, i, body, push)
+                            scatter(bodies, bodies.change, env, i, body, push)
                         else:
                             for side in range(2):
                                 b = body[side]

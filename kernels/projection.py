@@ -29,7 +29,7 @@ def make(real):
     vec3 = t.vec3
     Bodies, Contacts, Topology = t.Bodies, t.Contacts, t.Topology
     f = tree.functions(real)
-    Trees, product, scatter = f.Trees, f.product, f.scatter
+    Trees, product, scatter, descend = f.Trees, f.product, f.scatter, f.descend
     advance = tree.motion(real)
     error = joint_rows.functions(real).loop_error
 
@@ -104,25 +104,22 @@ def make(real):
                     y -= system[env, k, i] * right[env, k]
                 right[env, i] = y * system[env, i, i]
             # z = D^1/2 L delta, then delta.
-            for k in range(trees.before.shape[0]):
-                trees.mean[env, k] = real(0.0)
+            n = trees.before.shape[0]
+            for k in range(n):
+                trees.change[env, k] = real(0.0)
             row = int(0)
             for i in range(first, last):
                 kind = trees.row_kind[-1 - contacts.slot[env, i]]
                 if kind == LOOP_WAY or kind == LOOP_TURN:  # noqa: SIM109
                     push = vec3(right[env, row], right[env, row + 1], right[env, row + 2])
-                    scatter(trees, trees.mean, env, i, contacts.body[env, i], wp.transpose(contacts.frame[env, i]) * push)
+                    scatter(trees, trees.change, env, i, contacts.body[env, i], wp.transpose(contacts.frame[env, i]) * push)
                     row += 3
-            for k in range(trees.before.shape[0]):
-                y = trees.mean[env, k] * trees.scale[env, k]
-                j = trees.before[k]
-                for e in range(trees.row[k] + 1, trees.row[k + 1]):
-                    y -= trees.factor[env, e] * trees.mean[env, j]
-                    j = trees.before[j]
-                trees.mean[env, k] = y
-            for k in range(trees.before.shape[0]):
-                v[env, k] = v[env, k] + trees.mean[env, k] / h
+            for k in range(n):
+                trees.change[env, k] = wp.sqrt(trees.pivot[env, k]) * trees.change[env, k]
+            descend(trees, trees.gained, env)
+            for k in range(n):
+                v[env, k] = v[env, k] + trees.change[env, k] / h
             for b in range(trees.order.shape[0]):
-                advance(topology, trees, bodies, trees.mean, real(1.0), q, env, b)
+                advance(topology, trees, bodies, trees.change, real(1.0), q, env, b)
 
     return project

@@ -8,17 +8,21 @@ a point of its tree at which nothing is far away, so
 
     twist of a body = sum of s_i v_i over the path to it,      M_ij = s_i . I_c s_j   (j on the path to i),
 
-I_c the inertia of all that hangs on i, about O (composite rigid bodies: Featherstone 2008, section 6.2). M has an entry only
-where one degree of freedom is on the path to the other; it is kept in rows: M_ii, then those with the ancestors of i, nearest
-first. M = L^T D L (Featherstone 2008, section 6.5) has no other entries.
+I_c the inertia of all that hangs on i, about O (composite rigid bodies: Featherstone 2008, section 6.2). M is not formed in a step, its
+factors M = L^T D L come from inertias I_A of what hangs on i while its joints are free to give way (articulated bodies: section 7.3):
+
+    D_i = s_i . U_i + armature,  U_i = I_A s_i,  L_ij = U_i . s_j / D_i,      I_A - U_i U_i^T / D_i  is what the velocity before i sees.
+
+About one O for a whole tree nothing has to be transformed on the way, and M^-1 J^T p is one sweep up and one down the tree.
 
 c comes from the recursive Newton-Euler algorithm, at the mean of v and v_free: M (v_free - v) = h (f - c((v + v_free) / 2)). With the
-present v it would feed energy to what spins.
+present v it would feed energy to what spins. c changes by about h |v| of what the velocity does, so rounds end where the next one would
+change nothing that matters.
 
 A force r that joints pass on to a point x of a body turns with the joints above it: K_ij = a_j . sum of (dx/dq_i x r), a_j the axis
 of rotation of j on the path to i. Where h^2 K is not small (light links that hold a heavy end swing at 1000 rad/s), M + h^2 K / 4 stands
 for M: a swing at w then turns as before where h w is small, and is stable at any h w. Where h w > 2, which no step
-resolves, it is damped as well (docs/theory.md).
+resolves, it is damped as well (docs/theory.md). K_ij = s_j . G s_i, G a sum over what hangs on i, so that it enters I_A as an inertia does.
 
 Contacts see a tree through half of J M^-1 J^T, y = D^-1/2 L^-T J^T (``Trees.half``): W_ij is the product of two halves over what their
 paths share, and in z = D^1/2 L v the mass matrix is the identity.
@@ -49,8 +53,9 @@ LOOP_TURN = wp.constant(3)
 CLOSER = wp.constant(4)
 FURTHER = wp.constant(5)
 
-# Rounds in which c follows the mean velocity, and the change [of the velocity] that ends them.
+# Rounds in which c follows the mean velocity.
 BIAS_ROUNDS = wp.constant(6)
+SETTLED = wp.constant(1.0e-2)
 # h^2 / 4 of the geometric stiffness goes into M where it is more than this part of a pivot of M...
 STIFF = wp.constant(0.01)
 # ... and where it is more than this part, the velocity is damped by this part of h times the stiffness.
@@ -65,6 +70,7 @@ def functions(real) -> SimpleNamespace:
     """Bundle ``Trees``, and what other stages need of it."""
     t = scalar_types(real)
     vec3, mat33, transform, spatial = t.vec3, t.mat33, t.transform, t.spatial
+    mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
 
     @wp.struct
     class Trees:
@@ -86,7 +92,6 @@ def functions(real) -> SimpleNamespace:
         before: wp.array(dtype=int)  # [V] the one before it on its path, -1 = none
         depth: wp.array(dtype=int)  # [V] how many come before it on its path
         path: wp.array2d(dtype=int)  # [B, D] velocities on the path to a body, from the root; -1 behind the last one
-        row: wp.array(dtype=int)  # [V + 1] first entry of its row of M
         shared: wp.array2d(dtype=int)  # [B, B] how many velocities the paths to two bodies have in common
         armature: wp.array2d(dtype=real)  # [1|E, V] added to M_ii, kg or kg m^2
         damping: wp.array2d(dtype=real)  # [1|E, V] force by velocity, N s/m or N m s
@@ -115,62 +120,27 @@ def functions(real) -> SimpleNamespace:
         free_velocity: wp.array2d(dtype=spatial)  # [E, B]
         # Of a step:
         origin: wp.array2d(dtype=vec3)  # [E, B] O of a tree, at its root
-        linear: wp.array2d(dtype=vec3)  # [E, V] s_i: velocity at O
-        angular: wp.array2d(dtype=vec3)  # [E, V]
+        screw: wp.array2d(dtype=spatial)  # [E, V] s_i: velocity at O, angular velocity
+        taken: wp.array2d(dtype=spatial)  # [E, V] U_i / D_i: of an impulse along i what does not reach beyond it
+        pivot: wp.array2d(dtype=real)  # [E, V] D_i
+        scale: wp.array2d(dtype=real)  # [E, V] D^-1/2, 0 where the velocity is prescribed
         twist: wp.array2d(dtype=spatial)  # [E, B] velocity at O, angular velocity
-        acceleration: wp.array2d(dtype=spatial)  # [E, B] of a body while all v_i stay as they are; then the force that it takes
+        gained: wp.array2d(dtype=spatial)  # [E, B] what it becomes less that
+        carried: wp.array2d(dtype=spatial)  # [E, B] acceleration of a body about O while all v_i stay as they are
+        push: wp.array2d(dtype=spatial)  # [E, B] impulse of all but joints on a body, and its moment about O
         own: wp.array2d(dtype=mat33)  # [E, B] inertia of a body about its centre of mass
         mass: wp.array2d(dtype=real)  # [E, B] of all that hangs on a body, itself included...
         moment: wp.array2d(dtype=vec3)  # ... its mass times its centre of mass from O
         inertia: wp.array2d(dtype=mat33)  # ... and its inertia about O
-        matrix: wp.array2d(dtype=real)  # [E, N] M + h (damping), row by row
-        stiff: wp.array2d(dtype=real)  # [E, N] h^2 / 4 of the geometric stiffness
-        factor: wp.array2d(dtype=real)  # [E, N] L, and D on the diagonal
+        articulated: wp.array2d(dtype=mat66)  # [E, B] I_A
+        pull: wp.array2d(dtype=vec3)  # [E, B] force that inertia and weight of what hangs on a body ask of its joint...
+        virial: wp.array2d(dtype=mat33)  # ... and the sum of r x^T of its parts, x where it acts: what turns it into K
+        given: wp.array2d(dtype=real)  # [E, V] impulse along a velocity that c does not change
         calming: wp.array2d(dtype=real)  # [E, V] damping of what no step resolves, N s/m or N m s
-        scale: wp.array2d(dtype=real)  # [E, V] D^-1/2
-        mean: wp.array2d(dtype=real)  # [E, V] (v + v_free) / 2
         free: wp.array2d(dtype=real)  # [E, V] v_free
         change: wp.array2d(dtype=real)  # [E, V] v+ - v_free in the end; scratch of the solver
         longest: int  # D
         half: wp.array2d(dtype=vec3)  # [E, 2 R D] D^-1/2 L^-T J^T of each contact and side, world axes, by depth
-
-    @wp.func
-    def factorise(before: wp.array(dtype=int), row: wp.array(dtype=int), factor: wp.array2d(dtype=real), env: int):
-        """M in `factor` becomes L and D, from the leaves to the roots, without fill."""
-        n = before.shape[0]
-        for kk in range(n):
-            k = n - 1 - kk
-            at = row[k]
-            inverse = real(1.0) / factor[env, at]
-            i = before[k]
-            e = at + 1
-            while i >= 0:
-                a = factor[env, e] * inverse
-                for c in range(row[i + 1] - row[i]):
-                    factor[env, row[i] + c] = factor[env, row[i] + c] - a * factor[env, e + c]
-                factor[env, e] = a
-                i = before[i]
-                e += 1
-
-    @wp.func
-    def solve(before: wp.array(dtype=int), row: wp.array(dtype=int), factor: wp.array2d(dtype=real), x: wp.array2d(dtype=real), env: int):
-        """x := M^-1 x = L^-1 D^-1 L^-T x."""
-        n = before.shape[0]
-        for kk in range(n):
-            k = n - 1 - kk
-            y = x[env, k]
-            if y != real(0.0):
-                j = before[k]
-                for e in range(row[k] + 1, row[k + 1]):
-                    x[env, j] = x[env, j] - factor[env, e] * y
-                    j = before[j]
-        for k in range(n):
-            y = x[env, k] / factor[env, row[k]]
-            j = before[k]
-            for e in range(row[k] + 1, row[k + 1]):
-                y -= factor[env, e] * x[env, j]
-                j = before[j]
-            x[env, k] = y
 
     @wp.func
     def pair(top: vec3, bottom: vec3) -> spatial:
@@ -182,23 +152,63 @@ def functions(real) -> SimpleNamespace:
         return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), x)
 
     @wp.func
-    def twists(trees: Trees, rates: wp.array2d(dtype=real), velocity: wp.array2d(dtype=spatial), env: int):
-        """Velocities of all bodies (centre of mass, angular) from those of the joints; trees.twist about O."""
+    def added(trees: Trees, h: real, env: int, i: int) -> real:
+        """What armature, damping and drives add to M_ii, implicit."""
+        armature = trees.armature[env % trees.armature.shape[0], i]
+        damping = trees.damping[env % trees.damping.shape[0], i] + trees.calming[env, i]
+        stiffness = trees.stiffness[env % trees.stiffness.shape[0], i]
+        return armature + h * (damping + trees.rate[env % trees.rate.shape[0], i] + h * stiffness)
+
+    @wp.func
+    def inertia_along(trees: Trees, h: real, env: int, b: int, i: int) -> real:
+        """M_ii of a velocity of the joint above body b, with what damping adds to it."""
+        linear = wp.spatial_top(trees.screw[env, i])
+        angular = wp.spatial_bottom(trees.screw[env, i])
+        moment = trees.moment[env, b]
+        force = trees.mass[env, b] * linear + wp.cross(angular, moment)
+        turning = trees.inertia[env, b] * angular + wp.cross(moment, linear)
+        return wp.dot(linear, force) + wp.dot(angular, turning) + added(trees, h, env, i)
+
+    @wp.func
+    def descend(trees: Trees, gained: wp.array2d(dtype=spatial), env: int):
+        """trees.change := L^-1 D^-1 of it, `gained` the twists of all bodies at those velocities."""
         for k in range(trees.order.shape[0]):
             b = trees.order[k]
             parent = trees.parent[b]
             twist = spatial()
             if parent >= 0:
-                twist = trees.twist[env, parent]
+                twist = gained[env, parent]
             for i in range(trees.first[b], trees.end[b]):
-                twist += rates[env, i] * pair(trees.linear[env, i], trees.angular[env, i])
-            trees.twist[env, b] = twist
-            r = trees.com[env, b] - trees.origin[env, trees.root[b]]
-            velocity[env, b] = pair(moved_by(twist, r), wp.spatial_bottom(twist))
+                scale = trees.scale[env, i]
+                x = scale * scale * trees.change[env, i] - wp.dot(trees.taken[env, i], twist)
+                trees.change[env, i] = x
+                twist += x * trees.screw[env, i]
+            gained[env, b] = twist
+
+    @wp.func
+    def propagate(trees: Trees, wrench: wp.array2d(dtype=spatial), gained: wp.array2d(dtype=spatial), env: int):
+        """Impulses on all bodies about O and, in trees.change, along the joints become what they change of the velocities of both.
+
+        M^-1 = L^-1 D^-1 L^-T; `gained` may be `wrench`.
+        """
+        bodies = trees.order.shape[0]
+        for k in range(bodies):
+            b = trees.order[bodies - 1 - k]
+            push = wrench[env, b]
+            first = trees.first[b]
+            for ii in range(trees.end[b] - first):
+                i = trees.end[b] - 1 - ii
+                y = trees.change[env, i] + wp.dot(trees.screw[env, i], push)
+                trees.change[env, i] = y
+                push -= y * trees.taken[env, i]
+            parent = trees.parent[b]
+            if parent >= 0:
+                wrench[env, parent] = wrench[env, parent] + push
+        descend(trees, gained, env)
 
     @wp.func
     def respond(trees: Trees, velocity: wp.array2d(dtype=spatial), env: int):
-        """Wrenches on all bodies about their centres of mass [N s, N m s] become what they change of their velocities.
+        """Impulses on all bodies about their centres of mass [N s, N m s] become what they change of their velocities.
 
         trees.change: impulses along the joints before, what changes of their velocities after: M^-1 J^T p.
         """
@@ -206,42 +216,29 @@ def functions(real) -> SimpleNamespace:
             push = wp.spatial_top(velocity[env, b])
             r = trees.com[env, b] - trees.origin[env, trees.root[b]]
             velocity[env, b] = pair(push, wp.spatial_bottom(velocity[env, b]) + wp.cross(r, push))
-        for k in range(trees.order.shape[0]):
-            b = trees.order[trees.order.shape[0] - 1 - k]
-            wrench = velocity[env, b]
-            for i in range(trees.first[b], trees.end[b]):
-                trees.change[env, i] = trees.change[env, i] + wp.dot(pair(trees.linear[env, i], trees.angular[env, i]), wrench)
-                if trees.kind[i] == PRESCRIBED:
-                    trees.change[env, i] = real(0.0)
-            parent = trees.parent[b]
-            if parent >= 0:
-                velocity[env, parent] = velocity[env, parent] + wrench
-        solve(trees.before, trees.row, trees.factor, trees.change, env)
-        twists(trees, trees.change, velocity, env)
+        propagate(trees, velocity, velocity, env)
+        for b in range(trees.order.shape[0]):
+            r = trees.com[env, b] - trees.origin[env, trees.root[b]]
+            velocity[env, b] = pair(moved_by(velocity[env, b], r), wp.spatial_bottom(velocity[env, b]))
 
     @wp.func
-    def divide(trees: Trees, env: int, first: int, body: int):
-        """J^T on the path to a body becomes D^-1/2 L^-T J^T."""
-        i = trees.last[body]
+    def divide(trees: Trees, env: int, first: int, last: int, force: mat33, moment: mat33):
+        """D^-1/2 L^-T J^T from velocity `last` on, of three wrenches about O there, the columns of force and moment."""
+        i = int(last)
         while i >= 0:
-            at = first + trees.depth[i]
-            y = trees.half[env, at]
-            for e in range(trees.row[i] + 1, trees.row[i + 1]):
-                at -= 1
-                trees.half[env, at] = trees.half[env, at] - trees.factor[env, e] * y
+            screw = trees.screw[env, i]
+            taken = trees.taken[env, i]
+            y = wp.spatial_top(screw) * force + wp.spatial_bottom(screw) * moment
             trees.half[env, first + trees.depth[i]] = trees.scale[env, i] * y
+            force -= wp.outer(wp.spatial_top(taken), y)
+            moment -= wp.outer(wp.spatial_bottom(taken), y)
             i = trees.before[i]
 
     @wp.func
     def halve(trees: Trees, env: int, side: int, body: int, point: vec3):
         """Of one side of a contact (number 2 i + side): J M^-1 J^T is the sum of the squares of its entries."""
         x = point - trees.origin[env, trees.root[body]]
-        first = side * trees.longest
-        i = trees.last[body]
-        while i >= 0:
-            trees.half[env, first + trees.depth[i]] = trees.linear[env, i] + wp.cross(trees.angular[env, i], x)
-            i = trees.before[i]
-        divide(trees, env, first, body)
+        divide(trees, env, side * trees.longest, trees.last[body], wp.identity(n=3, dtype=real), wp.skew(x))
 
     @wp.func
     def product(
@@ -333,11 +330,12 @@ def functions(real) -> SimpleNamespace:
         joint_velocity=joint_velocity,
         gather=gather,
         scatter=scatter,
-        factorise=factorise,
-        solve=solve,
         pair=pair,
         moved_by=moved_by,
-        twists=twists,
+        added=added,
+        inertia_along=inertia_along,
+        descend=descend,
+        propagate=propagate,
         respond=respond,
         halve=halve,
         product=product,
@@ -395,10 +393,12 @@ def make(real) -> SimpleNamespace:
     vec3, mat33, quat, transform, spatial = t.vec3, t.mat33, t.quat, t.transform, t.spatial
     Bodies, Parameters, Topology = t.Bodies, t.Parameters, t.Topology
     f = functions(real)
-    Trees, factorise, solve = f.Trees, f.factorise, f.solve
-    pair, moved_by, twists = f.pair, f.moved_by, f.twists
+    Trees, pair, moved_by, propagate = f.Trees, f.pair, f.moved_by, f.propagate
+    added, inertia_along = f.added, f.inertia_along
+    mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
     advance = motion(real)
-    settled = real(1.0e-10) if real is wp.float64 else real(1.0e-6)
+    rounding = real(1.0e-16) if real is wp.float64 else real(1.0e-7)
+    settled = real(1.0e-9) if real is wp.float64 else real(1.0e-6)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def kinematics(
@@ -433,10 +433,8 @@ def make(real) -> SimpleNamespace:
                         i = trees.first[b] + k
                         axis = vec3()
                         axis[k] = real(1.0)
-                        trees.linear[env, i] = axis
-                        trees.angular[env, i] = vec3()
-                        trees.linear[env, i + 3] = vec3()
-                        trees.angular[env, i + 3] = axis
+                        trees.screw[env, i] = pair(axis, vec3())
+                        trees.screw[env, i + 3] = pair(vec3(), axis)
                         twist[k] = v[env, i]
                         twist[3 + k] = v[env, i + 3]
                 else:
@@ -464,9 +462,9 @@ def make(real) -> SimpleNamespace:
                                 i_q += 4
                             angular = wp.quat_rotate(turn, trees.axis[i])
                             linear = wp.cross(x - origin, angular)
-                        trees.linear[env, i] = linear
-                        trees.angular[env, i] = angular
-                        twist += v[env, i] * pair(linear, angular)
+                        screw = pair(linear, angular)
+                        trees.screw[env, i] = screw
+                        twist += v[env, i] * screw
                     pose = transform(x, turn) * trees.child_pose[b]
                 bodies.pose[env, b] = pose
                 trees.twist[env, b] = twist
@@ -482,190 +480,171 @@ def make(real) -> SimpleNamespace:
         return pair(wp.cross(w, wp.spatial_top(s)) + wp.cross(wp.spatial_top(twist), angular), wp.cross(w, angular))
 
     @wp.func
-    def accelerations(topology: Topology, trees: Trees, with_change: real, env: int):
-        """Twists at the velocities trees.mean, and accelerations of bodies about O while dv/dt is with_change [1/s] times trees.change."""
-        for k in range(trees.order.shape[0]):
-            b = trees.order[k]
-            parent = trees.parent[b]
-            twist = spatial()
-            acceleration = spatial()
-            if parent >= 0:
-                twist = trees.twist[env, parent]
-                acceleration = trees.acceleration[env, parent]
-            carried = twist  # what carries the axes of a ball, all three: what was before them
-            for i in range(trees.first[b], trees.end[b]):
-                s = pair(trees.linear[env, i], trees.angular[env, i])
-                rate = trees.mean[env, i]
-                kind = trees.kind[i]
-                if kind < FREE:
-                    if kind != BALL_ON:
-                        carried = twist
-                    acceleration += rate * cross_motion(carried, s)
-                acceleration += with_change * trees.change[env, i] * s
-                twist += rate * s
-            if topology.joint_type[b] == FREE_JOINT or topology.joint_type[b] == KINEMATIC:
-                # The axes of rotation go through the centre of mass and move with it.
-                acceleration += pair(wp.cross(wp.spatial_top(twist), wp.spatial_bottom(twist)), vec3())
-            trees.twist[env, b] = twist
-            trees.acceleration[env, b] = acceleration
-
-    @wp.func
-    def own_force(m: real, r: vec3, inertia: mat33, twist: spatial, acceleration: spatial):
-        """Force at the centre of mass, r from O, and moment about O that a body takes: I a + v x* I v; inertia about that centre."""
-        w = wp.spatial_bottom(twist)
-        p = m * moved_by(twist, r)
-        force = m * moved_by(acceleration, r) + wp.cross(w, p)
-        # Of the angular momentum L = I w + r x p about O:  w x L + v_O x p, and what the acceleration adds.
-        moment = inertia * wp.spatial_bottom(acceleration) + wp.cross(r, m * moved_by(acceleration, r))
-        moment += wp.cross(w, inertia * w + wp.cross(r, p)) + wp.cross(wp.spatial_top(twist), p)
-        return force, moment
-
-    @wp.func
     def forces(
         topology: Topology,
         parameters: Parameters,
         trees: Trees,
         wrench: wp.array2d(dtype=spatial),
+        v: wp.array2d(dtype=real),
+        part: real,
+        h: real,
         bodies: Bodies,
         env: int,
     ):
-        """trees.change := f_a - c at the velocities trees.mean: what gravity, wrenches and inertia leave along each axis."""
-        accelerations(topology, trees, real(0.0), env)
+        """trees.push := what gravity, wrenches and inertia give to each body within h [N s, N m s about O].
+
+        At the mean of v and v + trees.change, or at rest (part = 1, 0); its twists are trees.twist and trees.gained.
+        """
         gravity = parameters.gravity[env % parameters.gravity.shape[0]]
-        for b in range(trees.parent.shape[0]):
-            r = bodies.com[env, b] - trees.origin[env, trees.root[b]]
-            m = parameters.mass[env % parameters.mass.shape[0], b]
-            force, moment = own_force(m, r, trees.own[env, b], trees.twist[env, b], trees.acceleration[env, b])
-            applied = m * gravity + wp.spatial_top(wrench[env, b])
-            trees.acceleration[env, b] = pair(force - applied, moment - wp.cross(r, applied) - wp.spatial_bottom(wrench[env, b]))
         for k in range(trees.order.shape[0]):
-            b = trees.order[trees.order.shape[0] - 1 - k]
-            taken = trees.acceleration[env, b]
-            for i in range(trees.first[b], trees.end[b]):
-                trees.change[env, i] = -wp.dot(pair(trees.linear[env, i], trees.angular[env, i]), taken)
+            b = trees.order[k]
             parent = trees.parent[b]
+            twist = part * (trees.twist[env, b] + real(0.5) * trees.gained[env, b])
+            acceleration = spatial()
             if parent >= 0:
-                trees.acceleration[env, parent] = trees.acceleration[env, parent] + taken
+                acceleration = trees.carried[env, parent]
+            kind = topology.joint_type[b]
+            if kind == FREE_JOINT or kind == KINEMATIC:  # noqa: SIM109
+                # The axes of rotation go through the centre of mass and move with it.
+                acceleration = pair(wp.cross(wp.spatial_top(twist), wp.spatial_bottom(twist)), vec3())
+            else:
+                # Each axis is carried by what is before it, the three of a ball by what is before them all.
+                carrier = twist
+                joint = spatial()
+                for ii in range(trees.end[b] - trees.first[b]):
+                    i = trees.end[b] - 1 - ii
+                    joint += (part * (v[env, i] + real(0.5) * trees.change[env, i])) * trees.screw[env, i]
+                    if trees.kind[i] != BALL_ON:
+                        carrier -= joint
+                        acceleration += cross_motion(carrier, joint)
+                        joint = spatial()
+            trees.carried[env, b] = acceleration
+            # Force at the centre of mass, r from O, and moment about O that the body takes, I a + v x* I v, less those applied.
+            m = parameters.mass[env % parameters.mass.shape[0], b]
+            r = bodies.com[env, b] - trees.origin[env, trees.root[b]]
+            w = wp.spatial_bottom(twist)
+            p = m * moved_by(twist, r)
+            force = m * (moved_by(acceleration, r) - gravity) + wp.cross(w, p) - wp.spatial_top(wrench[env, b])
+            # The angular momentum about the centre of mass changes by w x I w and by what the acceleration adds.
+            inertia = trees.own[env, b]
+            moment = inertia * wp.spatial_bottom(acceleration) + wp.cross(w, inertia * w) - wp.spatial_bottom(wrench[env, b])
+            trees.push[env, b] = (-h) * pair(force, moment + wp.cross(r, force))
 
     @wp.func
-    def stiffen(
-        topology: Topology,
-        parameters: Parameters,
-        trees: Trees,
-        wrench: wp.array2d(dtype=spatial),
-        bodies: Bodies,
-        h: real,
-        env: int,
-    ) -> bool:
-        """Add h^2 / 4 of the geometric stiffness to M where it matters, see above; trees.change is v_free - v as it is without."""
-        accelerations(topology, trees, real(1.0) / h, env)
-        gravity = parameters.gravity[env % parameters.gravity.shape[0]]
+    def inertias(parameters: Parameters, trees: Trees, bodies: Bodies, env: int):
         for b in range(trees.parent.shape[0]):
-            r = bodies.com[env, b] - trees.origin[env, trees.root[b]]
+            rotation = wp.quat_to_matrix(wp.transform_get_rotation(bodies.pose[env, b]))
+            trees.own[env, b] = rotation * parameters.inertia[env % parameters.inertia.shape[0], b] * wp.transpose(rotation)
+
+    @wp.func
+    def turning(force: vec3, virial: mat33) -> mat66:
+        """G: K_ij = s_j . G s_i."""
+        turn = virial - wp.trace(virial) * wp.identity(n=3, dtype=real)
+        shift = wp.skew(force)
+        g = mat66()
+        for i in range(3):
+            for j in range(3):
+                g[3 + i, j] = -shift[i, j]
+                g[3 + i, 3 + j] = turn[i, j]
+        return g
+
+    @wp.func
+    def pulled(parameters: Parameters, trees: Trees, bodies: Bodies, h: real, env: int, b: int):
+        """r and the force that inertia and weight of a body ask of its joint, from trees.push and trees.gained."""
+        r = bodies.com[env, b] - trees.origin[env, trees.root[b]]
+        m = parameters.mass[env % parameters.mass.shape[0], b]
+        return r, (m * moved_by(trees.gained[env, b], r) - wp.spatial_top(trees.push[env, b])) / h
+
+    @wp.func
+    def factorise(parameters: Parameters, trees: Trees, bodies: Bodies, h: real, stiffer: bool, env: int) -> bool:
+        """M with what damping adds to it in an implicit step, and h^2 K / 4 (see above) if `stiffer`; is it positive definite?"""
+        for b in range(trees.parent.shape[0]):
             m = parameters.mass[env % parameters.mass.shape[0], b]
-            force, _ = own_force(m, r, trees.own[env, b], trees.twist[env, b], trees.acceleration[env, b])
-            force -= m * gravity + wp.spatial_top(wrench[env, b])
-            trees.moment[env, b] = force
-            trees.inertia[env, b] = wp.outer(r, force)
-        matters = bool(False)
+            r = bodies.com[env, b] - trees.origin[env, trees.root[b]]
+            about = trees.own[env, b] + m * (wp.diag(vec3(wp.dot(r, r))) - wp.outer(r, r))
+            shift = m * wp.skew(r)
+            trees.mass[env, b] = m
+            trees.moment[env, b] = m * r
+            trees.inertia[env, b] = about
+            whole = mat66()
+            for i in range(3):
+                whole[i, i] = m
+                for j in range(3):
+                    whole[i, 3 + j] = -shift[i, j]
+                    whole[3 + i, j] = shift[i, j]
+                    whole[3 + i, 3 + j] = about[i, j]
+            if stiffer:
+                at, force = pulled(parameters, trees, bodies, h, env, b)
+                whole += (real(0.25) * h * h) * turning(force, wp.outer(at, force))
+            trees.articulated[env, b] = whole
+        positive = bool(True)
+        for k in range(trees.order.shape[0]):
+            b = trees.order[trees.order.shape[0] - 1 - k]
+            whole = trees.articulated[env, b]
+            for ii in range(trees.end[b] - trees.first[b]):
+                i = trees.end[b] - 1 - ii
+                if trees.kind[i] == PRESCRIBED:
+                    trees.scale[env, i] = real(0.0)
+                    trees.taken[env, i] = spatial()
+                    trees.pivot[env, i] = real(1.0)
+                else:
+                    screw = trees.screw[env, i]
+                    u = whole * screw
+                    pivot = wp.dot(screw, u) + added(trees, h, env, i)
+                    taken = (real(1.0) / pivot) * u
+                    whole -= wp.outer(taken, u)
+                    positive = positive and pivot > real(0.0)
+                    trees.taken[env, i] = taken
+                    trees.pivot[env, i] = pivot
+                    trees.scale[env, i] = real(1.0) / wp.sqrt(pivot)
+            parent = trees.parent[b]
+            if parent >= 0:
+                trees.articulated[env, parent] = trees.articulated[env, parent] + whole
+                trees.mass[env, parent] = trees.mass[env, parent] + trees.mass[env, b]
+                trees.moment[env, parent] = trees.moment[env, parent] + trees.moment[env, b]
+                trees.inertia[env, parent] = trees.inertia[env, parent] + trees.inertia[env, b]
+        return positive
+
+    @wp.func
+    def matters(parameters: Parameters, trees: Trees, bodies: Bodies, h: real, env: int) -> bool:
+        """Is h^2 K / 4 a part of M anywhere that must not be left out? Where no step resolves it the velocity is damped from now on."""
+        for b in range(trees.parent.shape[0]):
+            r, force = pulled(parameters, trees, bodies, h, env, b)
+            trees.pull[env, b] = force
+            trees.virial[env, b] = wp.outer(r, force)
+        result = bool(False)
         for k in range(trees.order.shape[0]):
             b = trees.order[trees.order.shape[0] - 1 - k]
             parent = trees.parent[b]
-            force = trees.moment[env, b]
-            virial = trees.inertia[env, b]
+            force = trees.pull[env, b]
+            virial = trees.virial[env, b]
             if parent >= 0:
-                trees.moment[env, parent] = trees.moment[env, parent] + force
-                trees.inertia[env, parent] = trees.inertia[env, parent] + virial
+                trees.pull[env, parent] = trees.pull[env, parent] + force
+                trees.virial[env, parent] = trees.virial[env, parent] + virial
             for i in range(trees.first[b], trees.end[b]):
                 if trees.kind[i] != PRESCRIBED:
-                    angular = trees.angular[env, i]
-                    g = wp.cross(trees.linear[env, i], force) + virial * angular - wp.trace(virial) * angular
-                    g = real(0.25) * h * h * g
-                    at = trees.row[i]
-                    matters = matters or wp.abs(wp.dot(g, angular)) > real(STIFF) * trees.factor[env, at]
-                    j = int(i)
-                    for e in range(at, trees.row[i + 1]):
-                        trees.stiff[env, e] = wp.dot(trees.angular[env, j], g)
-                        j = trees.before[j]
-                    own = wp.dot(g, angular)
-                    if own > real(UNRESOLVED) * trees.factor[env, at]:
+                    screw = trees.screw[env, i]
+                    axis = wp.spatial_bottom(screw)
+                    g = wp.cross(wp.spatial_top(screw), force) + virial * axis - wp.trace(virial) * axis
+                    own = real(0.25) * h * h * wp.dot(g, axis)
+                    pivot = trees.pivot[env, i]
+                    result = result or wp.abs(own) > real(STIFF) * pivot
+                    if own > real(UNRESOLVED) * pivot:
                         trees.calming[env, i] = real(CALM) * real(4.0) * own / h
-                        trees.stiff[env, at] = trees.stiff[env, at] + h * trees.calming[env, i]
-        if matters:
-            n = trees.before.shape[0]
-            for e in range(trees.matrix.shape[1]):
-                trees.factor[env, e] = trees.matrix[env, e] + trees.stiff[env, e]
-            factorise(trees.before, trees.row, trees.factor, env)
-            positive = bool(True)
-            for i in range(n):
-                positive = positive and trees.factor[env, trees.row[i]] > real(0.0)
-            for e in range(trees.matrix.shape[1]):
-                if positive:
-                    trees.matrix[env, e] = trees.matrix[env, e] + trees.stiff[env, e]
-                else:
-                    trees.factor[env, e] = trees.matrix[env, e]
-            if not positive:  # something is about to topple: without
-                factorise(trees.before, trees.row, trees.factor, env)
-                for i in range(n):
-                    trees.calming[env, i] = real(0.0)
-        return matters
+        return result
 
     @wp.func
-    def drive(trees: Trees, q: wp.array2d(dtype=real), v: wp.array2d(dtype=real), h: real, env: int):
-        """trees.change from forces along the joints to impulses, with damping and drives, implicit: what is in M is taken from them."""
+    def impulses(trees: Trees, q: wp.array2d(dtype=real), v: wp.array2d(dtype=real), h: real, env: int):
+        """trees.given: of forces along the joints, damping and drives, implicit: what is in M is taken from them."""
         for i in range(trees.before.shape[0]):
-            force = trees.change[env, i] + trees.force[env, i]
-            force -= (trees.damping[env % trees.damping.shape[0], i] + trees.calming[env, i]) * v[env, i]
+            force = trees.force[env, i] - trees.damping[env % trees.damping.shape[0], i] * v[env, i]
             stiffness = trees.stiffness[env % trees.stiffness.shape[0], i]
             rate = trees.rate[env % trees.rate.shape[0], i]
             if stiffness > real(0.0):  # which a velocity without a coordinate does not have
                 force += stiffness * (trees.target[env, i] - q[env, trees.coordinate[i]] - h * v[env, i])
             if stiffness > real(0.0) or rate > real(0.0):
                 force += rate * (trees.target_rate[env, i] - v[env, i])
-            trees.change[env, i] = h * force
-            if trees.kind[i] == PRESCRIBED:
-                trees.change[env, i] = real(0.0)
-
-    @wp.func
-    def mass_matrix(topology: Topology, parameters: Parameters, trees: Trees, bodies: Bodies, h: real, env: int):
-        """Rows of M, with what damping adds to it in an implicit step."""
-        for b in range(trees.parent.shape[0]):
-            rotation = wp.quat_to_matrix(wp.transform_get_rotation(bodies.pose[env, b]))
-            own = rotation * parameters.inertia[env % parameters.inertia.shape[0], b] * wp.transpose(rotation)
-            m = parameters.mass[env % parameters.mass.shape[0], b]
-            r = bodies.com[env, b] - trees.origin[env, trees.root[b]]
-            trees.own[env, b] = own
-            trees.mass[env, b] = m
-            trees.moment[env, b] = m * r
-            trees.inertia[env, b] = own + m * (wp.diag(vec3(wp.dot(r, r))) - wp.outer(r, r))
-        for k in range(trees.order.shape[0]):
-            b = trees.order[trees.order.shape[0] - 1 - k]
-            parent = trees.parent[b]
-            m = trees.mass[env, b]
-            moment = trees.moment[env, b]
-            inertia = trees.inertia[env, b]
-            if parent >= 0:
-                trees.mass[env, parent] = trees.mass[env, parent] + m
-                trees.moment[env, parent] = trees.moment[env, parent] + moment
-                trees.inertia[env, parent] = trees.inertia[env, parent] + inertia
-            for i in range(trees.first[b], trees.end[b]):
-                at = trees.row[i]
-                linear = trees.linear[env, i]
-                angular = trees.angular[env, i]
-                force = m * linear + wp.cross(angular, moment)
-                turning = inertia * angular + wp.cross(moment, linear)
-                j = int(i)
-                for e in range(at, trees.row[i + 1]):
-                    trees.matrix[env, e] = wp.dot(trees.linear[env, j], force) + wp.dot(trees.angular[env, j], turning)
-                    j = trees.before[j]
-                added = trees.armature[env % trees.armature.shape[0], i] + h * trees.damping[env % trees.damping.shape[0], i]
-                added += h * (h * trees.stiffness[env % trees.stiffness.shape[0], i] + trees.rate[env % trees.rate.shape[0], i])
-                trees.matrix[env, at] = trees.matrix[env, at] + added
-                if trees.kind[i] == PRESCRIBED:
-                    trees.matrix[env, at] = real(1.0)
-        for e in range(trees.matrix.shape[1]):
-            trees.factor[env, e] = trees.matrix[env, e]
-        factorise(trees.before, trees.row, trees.factor, env)
+            trees.given[env, i] = h * force
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def dynamics(
@@ -682,19 +661,38 @@ def make(real) -> SimpleNamespace:
         """M(q), dense, and c(q, v) with what gravity takes from it, after kinematics; `nothing` is zero: wrenches are no part of c."""
         start, _ = wp.tid()
         for env in range(start, nothing.shape[0], stride):
-            mass_matrix(topology, parameters, trees, bodies, real(0.0), env)
             for i in range(trees.before.shape[0]):
-                trees.mean[env, i] = v[env, i]
-                j = int(i)
-                for e in range(trees.row[i], trees.row[i + 1]):
-                    mass[env, i, j] = trees.matrix[env, e]
-                    mass[env, j, i] = trees.matrix[env, e]
-                    j = trees.before[j]
-            forces(topology, parameters, trees, nothing, bodies, env)
-            for i in range(trees.before.shape[0]):
-                bias[env, i] = -trees.change[env, i]
-                if trees.kind[i] == PRESCRIBED:
-                    bias[env, i] = real(0.0)
+                trees.calming[env, i] = real(0.0)
+                trees.change[env, i] = real(0.0)
+            for b in range(trees.order.shape[0]):
+                trees.gained[env, b] = spatial()
+            inertias(parameters, trees, bodies, env)
+            factorise(parameters, trees, bodies, real(0.0), False, env)
+            forces(topology, parameters, trees, nothing, v, real(1.0), real(1.0), bodies, env)
+            for k in range(trees.order.shape[0]):
+                b = trees.order[trees.order.shape[0] - 1 - k]
+                push = trees.push[env, b]
+                parent = trees.parent[b]
+                if parent >= 0:
+                    trees.push[env, parent] = trees.push[env, parent] + push
+                moment = trees.moment[env, b]
+                for i in range(trees.first[b], trees.end[b]):
+                    screw = trees.screw[env, i]
+                    linear = wp.spatial_top(screw)
+                    angular = wp.spatial_bottom(screw)
+                    taken = pair(
+                        trees.mass[env, b] * linear + wp.cross(angular, moment), trees.inertia[env, b] * angular + wp.cross(moment, linear)
+                    )
+                    j = trees.before[i]
+                    while j >= 0:
+                        mass[env, i, j] = wp.dot(trees.screw[env, j], taken)
+                        mass[env, j, i] = mass[env, i, j]
+                        j = trees.before[j]
+                    mass[env, i, i] = wp.dot(screw, taken) + added(trees, real(0.0), env, i)
+                    bias[env, i] = -wp.dot(screw, push)
+                    if trees.kind[i] == PRESCRIBED:
+                        mass[env, i, i] = real(1.0)
+                        bias[env, i] = real(0.0)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def free_motion(
@@ -710,49 +708,68 @@ def make(real) -> SimpleNamespace:
     ):
         start, _ = wp.tid()
         for env in range(start, wrench.shape[0], stride):
-            mass_matrix(topology, parameters, trees, bodies, h, env)
             n = trees.before.shape[0]
             size = real(0.0)
             for i in range(n):
-                trees.mean[env, i] = v[env, i]
                 trees.free[env, i] = v[env, i]
+                trees.change[env, i] = real(0.0)
                 trees.calming[env, i] = real(0.0)
                 size = wp.max(size, wp.abs(v[env, i]))
+            for b in range(trees.order.shape[0]):
+                trees.gained[env, b] = spatial()
+            impulses(trees, q, v, h, env)
+            inertias(parameters, trees, bodies, env)
             searching = bool(True)
+            stiffer = bool(False)
+            stale = bool(True)  # M is no longer what was factorised
+            part = real(1.0)
             rounds = int(0)
             before = real(0.0)
+            whole = real(0.0)
             while searching:
-                forces(topology, parameters, trees, wrench, bodies, env)
-                drive(trees, q, v, h, env)
-                solve(trees.before, trees.row, trees.factor, trees.change, env)
+                forces(topology, parameters, trees, wrench, v, part, h, bodies, env)
+                if rounds == 1:
+                    stiffer = matters(parameters, trees, bodies, h, env)
+                    stale = stiffer
+                while stale:
+                    stale = not factorise(parameters, trees, bodies, h, stiffer, env) and stiffer
+                    if stale:  # something is about to topple: without
+                        stiffer = False
+                        for i in range(n):
+                            trees.calming[env, i] = real(0.0)
+                for i in range(n):
+                    trees.change[env, i] = trees.given[env, i] - h * trees.calming[env, i] * v[env, i]
+                propagate(trees, trees.push, trees.gained, env)
                 moved = real(0.0)
                 for i in range(n):
                     after = v[env, i] + trees.change[env, i]
                     moved = wp.max(moved, wp.abs(after - trees.free[env, i]))
+                    size = wp.max(size, wp.abs(after))
                     trees.free[env, i] = after
-                    trees.mean[env, i] = real(0.5) * (v[env, i] + after)
                 rounds += 1
-                searching = moved > settled * size and rounds < BIAS_ROUNDS
                 if rounds == 1:
-                    if stiffen(topology, parameters, trees, wrench, bodies, h, env):
-                        searching = True
-                elif searching and rounds > 2 and moved > real(0.5) * before:
+                    whole = moved
+                else:
+                    # The next round would change it by this part of what this one did.
+                    rate = wp.max(moved / before, h * size)
+                    matter = wp.min(settled * size, real(SETTLED) * rate * rate * whole) + rounding * size
+                    searching = moved * rate > matter and rounds < BIAS_ROUNDS
+                if searching and rounds > 2 and moved > real(0.5) * before:
                     # Rounds do not settle, a joint turns by about a radian in a step: without c, which would grow with the square of v,
                     # and joints calmed, as turning from one pose to another feeds them.
-                    for i in range(n):
-                        trees.mean[env, i] = real(0.0)
-                        if trees.kind[i] < FREE:
-                            own = real(SLOWED) * trees.matrix[env, trees.row[i]]
-                            trees.calming[env, i] = trees.calming[env, i] + own / h
-                            trees.matrix[env, trees.row[i]] = trees.matrix[env, trees.row[i]] + own
-                    for e in range(trees.matrix.shape[1]):
-                        trees.factor[env, e] = trees.matrix[env, e]
-                    factorise(trees.before, trees.row, trees.factor, env)
+                    part = real(0.0)
+                    for b in range(trees.order.shape[0]):
+                        for i in range(trees.first[b], trees.end[b]):
+                            if trees.kind[i] < FREE:
+                                inertia = inertia_along(trees, h, env, b, i)
+                                trees.calming[env, i] = trees.calming[env, i] + real(SLOWED) * inertia / h
+                    stale = True
                     rounds = BIAS_ROUNDS - 1
                 before = moved
-            for i in range(n):
-                trees.scale[env, i] = real(1.0) / wp.sqrt(trees.factor[env, trees.row[i]])
-            twists(trees, trees.free, bodies.free_velocity, env)
+            for b in range(trees.order.shape[0]):
+                r = bodies.com[env, b] - trees.origin[env, trees.root[b]]
+                gained = pair(moved_by(trees.gained[env, b], r), wp.spatial_bottom(trees.gained[env, b]))
+                bodies.free_velocity[env, b] = bodies.velocity[env, b] + gained
             for b in range(trees.order.shape[0]):
                 bodies.inv_mass[env, b] = real(0.0)
                 bodies.inv_inertia[env, b] = mat33()

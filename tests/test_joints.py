@@ -159,15 +159,16 @@ def test_mass_matrix_and_kinematics_of_every_joint():
 
 
 def mass_matrix(sim: wl.Simulator) -> np.ndarray:
-    """M of the first environment at the start of the last step."""
-    before, entries = sim.model.dof_before, iter(sim.mechanics.matrix.numpy()[0])
-    matrix = np.zeros((sim.model.nv, sim.model.nv))
+    """M = L^T D L of the first environment at the start of the last step, from the factors that the step had."""
+    trees, before = sim.mechanics, sim.model.dof_before
+    screw, taken, pivot = (array.numpy()[0] for array in (trees.screw, trees.taken, trees.pivot))
+    factor = np.eye(sim.model.nv)
     for i in range(sim.model.nv):
-        j = i
+        j = before[i]
         while j >= 0:
-            matrix[i, j] = matrix[j, i] = next(entries)
+            factor[i, j] = taken[i] @ screw[j]
             j = before[j]
-    return matrix
+    return factor.T @ np.diag(pivot) @ factor
 
 
 def test_accelerations_of_every_joint():

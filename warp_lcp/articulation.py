@@ -17,7 +17,7 @@ from .model import DofKind, Model
 
 
 def paths(model: Model) -> SimpleNamespace:
-    """How the velocities hang on each other: before, depth [nv], first, end, last, root [B], row [nv + 1]."""
+    """How the velocities hang on each other: before, depth [nv], first, end, last, root [B]."""
     before, nv = model.dof_before, model.nv
     depth = np.zeros(nv, dtype=np.int32)
     for i in range(nv):
@@ -29,10 +29,7 @@ def paths(model: Model) -> SimpleNamespace:
         last[b] = own[-1] if own else last[model.body_parent[b]]
         if model.body_parent[b] >= 0:
             root[b] = root[model.body_parent[b]]
-    row = np.r_[0, np.cumsum(depth + 1)].astype(np.int32)
-    return SimpleNamespace(
-        before=before, depth=depth, first=model.v_start, end=model.v_start + count, last=last[:-1], root=root[:-1], row=row
-    )
+    return SimpleNamespace(before=before, depth=depth, first=model.v_start, end=model.v_start + count, last=last[:-1], root=root[:-1])
 
 
 def arrays(sim: Any, Trees: Any) -> Any:
@@ -40,7 +37,7 @@ def arrays(sim: Any, Trees: Any) -> Any:
     model, t, real, bodies = sim.model, sim._types, sim.real, sim.bodies
     where = paths(model)
     trees = Trees()
-    for name in ("before", "depth", "first", "end", "last", "root", "row"):
+    for name in ("before", "depth", "first", "end", "last", "root"):
         setattr(trees, name, sim.ints(getattr(where, name)))
     trees.order, trees.parent, trees.kind = sim.ints(model.order), sim.ints(model.body_parent), sim.ints(model.dof_kind)
     on_path = path_table(where)
@@ -79,15 +76,15 @@ def arrays(sim: Any, Trees: Any) -> Any:
 def layout(model: Model, real: Any) -> list[tuple[str, int, Any]]:
     """Arrays of ``Trees`` that an environment has of its own: name, length, type."""
     t, where, extra = scalar_types(real), paths(model), len(rows(model))
-    n, b, entries, longest = model.nv, model.num_bodies, int(where.row[-1]), int(where.depth.max()) + 1
+    n, b, longest = model.nv, model.num_bodies, int(where.depth.max()) + 1
     table = (
-        ("origin moment", b, t.vec3),
-        ("twist acceleration", b, t.spatial),
-        ("own inertia", b, t.mat33),
+        ("origin moment pull", b, t.vec3),
+        ("twist gained carried push", b, t.spatial),
+        ("own inertia virial", b, t.mat33),
+        ("articulated", b, wp.types.matrix(shape=(6, 6), dtype=real)),
         ("mass", b, real),
-        ("linear angular", n, t.vec3),
-        ("matrix stiff factor", entries, real),
-        ("calming scale mean free change target target_rate force", n, real),
+        ("screw taken", n, t.spatial),
+        ("pivot scale given calming free change target target_rate force", n, real),
         ("row_scale", extra, t.vec3),
         ("half", 2 * (model.max_contacts + extra) * longest, t.vec3),
     )
