@@ -9,6 +9,7 @@ from test_usd import BODY, CM, JOINT, MASS, body, cube, layer, load, needs_share
 
 import warp_lcp as wl
 from warp_lcp import JointType
+from warp_lcp.joints import compose, inverse, rotate
 
 pytest.importorskip("pxr", reason="needs the extra 'usd'")
 
@@ -121,8 +122,6 @@ def test_what_is_not_simulated_is_named():
     assert [(i.path, i.why) for i in breaks.report.ignored] == [("/J", "joints do not break here")]
     cone = read(*pair("Spherical", "float physics:coneAngle0Limit = 30; float physics:coneAngle1Limit = 30;"))
     assert [i.path for i in cone.report.ignored] == ["/J"]
-    drive = 'uniform token drive:angular:physics:type = "acceleration"; float drive:angular:physics:stiffness = 3;'
-    assert "type acceleration is not supported" in refused(*pair("Revolute", drive, ("PhysicsDriveAPI:angular",)))
 
 
 def test_attributes_of_other_engines():
@@ -184,3 +183,130 @@ def test_numbers_are_the_decimals_that_were_written():
     assert model.joint_child_pose[1, :3].tolist() == [-0.1, 0.7, 0]
     assert model.limit[6].tolist() == [-0.7, 0.3]
     assert model.drive[6, [0, 2]].tolist() == [0.9, 0.6]
+
+
+# -- joints whose mobilities add ------------------------------------------------------------------------------------
+
+
+def root(*prims, adds=1, more=""):
+    """An articulation in which mobilities of joints between the same two bodies add."""
+    content = f"uniform bool newton:jointsAddMobility = {adds};{more}"
+    return prim("Xform", "Root", ("PhysicsArticulationRootAPI",), content + "".join(prims))
+
+
+ENDS = "rel physics:body0 = </Root/A>; rel physics:body1 = </Root/B>;"
+
+
+def stacked(*members, adds=1, at="(1, 0, 0)"):
+    """Two bodies, B one unit beside A, and joints (kind, name, axis, localPos0 on A, more) between them."""
+    bodies = [body("A", LIGHT, inner=""), body("B", LIGHT + xform(translate=at), inner="")]
+    joints = []
+    for kind, name, axis, place, more in members:
+        on_b = tuple(np.subtract(place, eval(at)).tolist())
+        frames = f"point3f physics:localPos0 = {place}; point3f physics:localPos1 = {on_b};"
+        along = f'uniform token physics:axis = "{axis}";' if kind != "Spherical" else ""
+        joints.append(joint(kind, ENDS + along + frames + more, (), name))
+    return [root(*bodies, *joints, adds=adds)]
+
+
+def relative(model, q):
+    """Pose of the second body in the first: of the last body, in a model whose first body is free."""
+    sim = wl.Simulator(model, device="cpu")
+    sim.q.assign(np.r_[model.q0[:7], q][None])
+    pose = sim.body_pose.numpy()[0]
+    return compose(inverse(pose[0]), pose[model.body_names.index("/Root/B")])
+
+
+def expected(motions, at=(1, 0, 0)):
+    """E_1 E_2 ... on where B stands at zero: each a way along an axis, or an angle about one through a point, as written in A."""
+    pose = np.array([0, 0, 0, 0, 0, 0, 1.0])
+    for kind, axis, point, value in motions:
+        direction = np.eye(3)["XYZ".index(axis)]
+        turn = np.r_[np.sin(value / 2) * direction, np.cos(value / 2)] if kind == "Revolute" else np.r_[0, 0, 0, 1.0]
+        way = value * direction if kind == "Prismatic" else np.array(point) - rotate(turn, np.array(point, dtype=float))
+        pose = compose(pose, np.r_[way, turn])
+    return compose(pose, np.array([*at, 0, 0, 0, 1.0]))
+
+
+STACKS = {
+    "universal": [("Revolute", "h1", "Y", (0.5, 0, 0), ""), ("Revolute", "h2", "X", (0.5, 0, 0), "")],
+    "left-handed": [("Revolute", name, name, (0.5, 0, 0), "") for name in "ZYX"],
+    "planar": [("Prismatic", "s1", "X", (0, 0, 0), ""), ("Prismatic", "s2", "Z", (1, 0, 0), ""), ("Revolute", "h", "Y", (0.2, 3, 0), "")],
+    "slide carried by a hinge": [("Revolute", "h", "Z", (0.2, 0, 0), ""), ("Prismatic", "s", "X", (0, 0, 0), "")],
+    "lines that meet elsewhere": [("Revolute", "h1", "Z", (0.5, 0, 3), ""), ("Revolute", "h2", "X", (4, 0, 0.25), "")],
+    "parallel hinges": [("Revolute", "h1", "Z", (0.25, 0, 0), ""), ("Revolute", "h2", "Z", (0.75, 0, 0), "")],
+    "skew hinges": [("Revolute", "h1", "Z", (0.25, 0, 0), ""), ("Revolute", "h2", "Y", (0.75, 0.1, 0), "")],
+}
+
+
+@pytest.mark.parametrize("case", STACKS)
+def test_mobilities_add_in_stage_order(case):
+    """Where the second body stands, at any coordinates; only axes of rotation that do not meet take a body between."""
+    members = STACKS[case]
+    model = load(*stacked(*members))
+    values = np.array([0.4, -0.3, 0.7])[: len(members)]
+    assert (model.dofs, len(model.loops)) == (6 + len(members), 0)
+    assert model.num_bodies == (3 if case in ("parallel hinges", "skew hinges") else 2)
+    motions = [(kind, axis, place, value) for (kind, _, axis, place, _), value in zip(members, values, strict=True)]
+    assert expected(motions) == pytest.approx(relative(model, values), abs=1e-9)
+    sim = wl.Simulator(model, device="cpu")
+    sim.step(10)
+    assert not sim.status.numpy().any()
+    assert "act one after the other" in " ".join(model.report.notes)
+
+
+def test_stack_of_slides_and_a_ball():
+    members = [("Prismatic", "s1", "X", (0, 0, 0), ""), ("Prismatic", "s2", "Y", (0, 0, 0), ""), ("Spherical", "b", "", (0.5, 0, 0), "")]
+    model = load(*stacked(*members))
+    assert model.joint_type.tolist().count(JointType.SPHERICAL) == 1
+    turn = np.array([0.1, 0.2, -0.3, math.sqrt(1 - 0.14)])
+    pose = relative(model, [0.4, -0.3, *turn])
+    assert pose == pytest.approx(np.r_[np.array([0.9, -0.3, 0]) + rotate(turn, np.array([0.5, 0, 0])), turn], abs=1e-9)
+
+
+def test_without_the_attribute_joints_between_the_same_bodies_hold_together():
+    model = load(*stacked(*STACKS["universal"], adds=0))
+    assert (model.dofs, [loop.name for loop in model.loops]) == (7, ["/Root/h2"])
+
+
+def test_limits_drives_and_states_of_a_stack_stay_with_their_axes():
+    more = "float physics:lowerLimit = -30; float physics:upperLimit = 60; float state:angular:physics:position = 45;"
+    more += "float newton:armature = 0.5;"
+    model = load(*stacked(("Revolute", "h1", "Z", (0, 0, 0), more), ("Revolute", "h2", "Y", (0, 0, 0), "float newton:damping = 2;")))
+    assert model.limit[6] == pytest.approx(np.radians([-30, 60]))
+    assert np.isinf(model.limit[7]).all()
+    assert model.armature[6:] == pytest.approx([0.5, 0])
+    assert model.damping[6:] == pytest.approx([0, 2 * 180 / math.pi])
+    assert model.q0[7:] == pytest.approx([math.pi / 4, 0], abs=1e-12)
+
+
+def test_stacks_that_are_none():
+    same = [("Revolute", "h1", "Z", (0, 0, 0), ""), ("Revolute", "h2", "Z", (0, 0, 0), "")]
+    assert "/Root/h1, /Root/h2 add mobilities that are not independent" in refused(*stacked(*same))
+    heavy = [(*m[:4], "float newton:armature = 1;") for m in same]
+    assert load(*stacked(*heavy)).dofs == 8
+    away = "point3f physics:localPos1 = (7, 0, 0);"
+    apart = [STACKS["universal"][0], joint("Revolute", ENDS + away, (), "h2")]
+    stage = stacked(apart[0])[0].rstrip().removesuffix("}") + apart[1] + "}"
+    assert "/Root/h1: it and /Root/h2 add their mobilities, but disagree about where /Root/B stands" in refused(stage)
+
+
+def test_dynamics_of_hinges_that_do_not_meet():
+    """Two parallel hinges with a body without mass between them are a double pendulum with a rod of no mass.
+
+    M = J^T diag(m, m, I) J of the end: at q = 0, B's centre 0.75 and 0.25 from the hinges.
+    """
+    model = load(*stacked(*STACKS["parallel hinges"]))
+    mass = wl.Simulator(model, device="cpu").mass_matrix().numpy()[0, 6:, 6:]
+    j = np.array([[0.75, 0.25], [1, 1]])  # velocity along y and angular velocity about z
+    assert mass == pytest.approx(j.T @ np.diag([2.0, 1.0]) @ j)
+
+
+@needs_shared
+def test_stacked_joints_of_the_converter(shared):
+    """MuJoCo's model has a free root with a universal joint, and one with a hinge."""
+    model = wl.load_usd(shared / "usd/converted/muc_stacked_joints/stacked_joints.usdc")
+    assert (model.num_bodies, model.dofs, len(model.loops)) == (4, 15, 0)
+    assert np.degrees(model.limit[6:8]) == pytest.approx(np.array([[-45, 45], [-30, 30]]))
+    axes = [rotate(model.joint_pose[1, 3:], model.dof_axis[i]) for i in (6, 7)]
+    assert np.array(axes) == pytest.approx(np.eye(3)[:2], abs=1e-12)

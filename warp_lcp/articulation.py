@@ -135,8 +135,9 @@ def rows(model: Model) -> list[Row]:
         if any(loop.ways):
             table.append(replace(base, held=loop.ways))
         if any(loop.turns):
-            gyration = [np.sqrt(np.trace(model.inertia[b]) / (2.0 * model.mass[b])) for b in loop.bodies if b >= 0 and model.movable[b]]
-            table.append(replace(base, kind=int(tree.LOOP_TURN), held=loop.turns, length=float(min(gyration))))
+            heavy = [b for b in loop.bodies if b >= 0 and model.movable[b] and model.mass[b] > 0.0]
+            gyration = [np.sqrt(np.trace(model.inertia[b]) / (2.0 * model.mass[b])) for b in heavy]
+            table.append(replace(base, kind=int(tree.LOOP_TURN), held=loop.turns, length=float(min(gyration, default=1.0))))
     return table
 
 

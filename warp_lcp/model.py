@@ -18,7 +18,8 @@ SPHERICAL  4    3    q: quaternion (x y z w) from the frame on the parent to tha
                      parent, axes of the frame on the body
 UNIVERSAL  2    2    angles about x, then about y as turned by the first
 PLANAR     3    3    ways along x and y, angle about z
-D6         n    n    any of the ways tx ty tz, then angles about rx ry rz, each as turned by those before it
+D6         n    n    any of the ways tx ty tz, then angles about rx ry rz, each as turned by those before it; or ways and angles
+                     along any axes in any order, each as moved by those before it
 ========== ==== ==== ==========================================================================================
 
 The frame of a joint on its parent and that on its body coincide where q is zero.
@@ -148,6 +149,9 @@ class Drive:
     """What pulls a joint's coordinate: stiffness (target - q) + damping (target_velocity - dq/dt), no more than max_force.
 
     N, m and s, or N m, rad and s. It is implicit: stiff gains are as stable as soft ones.
+
+    acceleration: gains are for each kg or kg m^2 that the coordinate moves in the initial configuration while forces act on no other,
+    1 / (M^-1)_ii; the Model has their products with it, which stay as they are while the scene moves and where masses are set anew.
     """
 
     stiffness: float = 0.0
@@ -155,6 +159,7 @@ class Drive:
     max_force: float = np.inf
     target: float = 0.0
     target_velocity: float = 0.0
+    acceleration: bool = False
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from .builder import ModelBuilder, capsule_solid, rotation_matrix
 from .errors import MissingExtra, ModelError, SceneError
 from .model import Ignored, JointType, Material, Model, Report, ShapeType
 from .usd_attributes import CONTACT_ATTRIBUTES, SURFACE_VELOCITY, unread, written
-from .usd_joints import JointReader
+from .usd_joints import JointReader, some
 from .usd_shapes import Solid, mesh_solid, round_solid
 
 _UNIFORM = 1e-4  # relative: scales closer than this are equal, axes closer than this are perpendicular
@@ -301,7 +301,7 @@ class _Reader:
         self._filter()
         self._other_prims()
         if self.unbound:
-            self.notes.append(f"no physics material on {_some(self.unbound)}: friction 0.5 / 0.5, no restitution")
+            self.notes.append(f"no physics material on {some(self.unbound)}: friction 0.5 / 0.5, no restitution")
         self._diagnostics(delegate)
         gx, gy, gz = self.builder.gravity.tolist()
         return SceneReading(
@@ -844,7 +844,3 @@ class _Reader:
 
 def _decimals(values: Any) -> np.ndarray:
     return np.array([written(v) for v in values])
-
-
-def _some(paths: list[str]) -> str:
-    return ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
