@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from test_usd import BODY, CM, JOINT, MASS, body, cube, layer, load, needs_shared, prim, read, refused, xform  # noqa: F401
+from test_usd import BODY, CM, JOINT, MASS, SI, body, cube, layer, load, needs_shared, prim, read, refused, stage, xform  # noqa: F401
 
 import warp_lcp as wl
 from warp_lcp import JointType
@@ -310,3 +310,88 @@ def test_stacked_joints_of_the_converter(shared):
     assert np.degrees(model.limit[6:8]) == pytest.approx(np.array([[-45, 45], [-30, 30]]))
     axes = [rotate(model.joint_pose[1, 3:], model.dof_axis[i]) for i in (6, 7)]
     assert np.array(axes) == pytest.approx(np.eye(3)[:2], abs=1e-12)
+
+
+# -- drives of type acceleration, states at the start ----------------------------------------------------------------
+
+WEIGHTLESS = prim("PhysicsScene", "Scene", (), "float physics:gravityMagnitude = 0;")
+
+
+def accelerated(mass, kind="Revolute", world=True, head=SI, more=""):
+    """k = 0.2 and b = 0.05 by degree (revolute), k = 4 and b = 3 (prismatic), target 40 degrees or 40 units."""
+    inst, k, b = ("angular", 0.2, 0.05) if kind == "Revolute" else ("linear", 4, 3)
+    drive = f'uniform token drive:{inst}:physics:type = "acceleration"; float drive:{inst}:physics:stiffness = {k};'
+    drive += f"float drive:{inst}:physics:damping = {b}; float drive:{inst}:physics:targetPosition = 40; {more}"
+    inertia = f"float physics:mass = {mass}; float3 physics:diagonalInertia = ({mass}, {2 * mass}, {2 * mass});"
+    bodies = [body(n, inertia + xform(translate="(0, 0, 3)"), inner="") for n in ("A", "B")[: 1 if world else 2]]
+    place = "point3f physics:localPos0 = (0, 0, 3);" if world else ""
+    ends = "rel physics:body1 = </A>;" if world else JOINT
+    return wl.load_usd(stage(WEIGHTLESS, *bodies, joint(kind, ends + place + drive, (f"PhysicsDriveAPI:{inst}",)), head=head))
+
+
+@pytest.mark.parametrize("world", [True, False])
+@pytest.mark.parametrize(("kind", "head"), [("Revolute", SI), ("Prismatic", SI), ("Revolute", CM), ("Prismatic", CM)])
+def test_drive_of_type_acceleration(kind, head, world):
+    """q'' = k (q* - q) - b q', whatever the masses and units of length; from rest after 0.5 s."""
+    angular, step = kind == "Revolute", 1e-4
+    k, b, goal = (0.2 * 180 / math.pi, 0.05 * 180 / math.pi, math.radians(40)) if angular else (4, 3, 40 * (0.01 if head == CM else 1))
+    w = np.emath.sqrt(k - b * b / 4)  # imaginary where it creeps
+    t = 0.5
+    exact = goal * (1 - np.exp(-b * t / 2) * (np.cos(w * t) + b / (2 * w) * np.sin(w * t))).real
+    for mass in (0.5, 300):
+        model = accelerated(mass, kind, world, head)
+        sim = wl.Simulator(model, dt=step, device="cpu")
+        sim.step(round(t / step))
+        assert sim.q.numpy()[0, -1] == pytest.approx(exact, rel=1e-3)
+    assert model.report.notes[-1].startswith("/J: gains of drives of type acceleration are multiplied by the inertia")
+
+
+def test_acceleration_drive_of_a_chain_has_the_inertia_of_all_it_moves():
+    """1 / (M^-1)_ii of the simulator's own M, where links are free to give way; the greatest force stays a force."""
+    frames = "point3f physics:localPos0 = (0.5, 0, 0); point3f physics:localPos1 = (-0.5, 0, 0);"
+    drive = 'uniform token drive:angular:physics:type = "acceleration"; float drive:angular:physics:stiffness = 1;'
+    drive += 'float drive:angular:physics:maxForce = 7; uniform token physics:axis = "Z"; float newton:armature = 0.3;'
+    names = ("A", "B", "C")
+    bodies = [body(n, LIGHT + xform(translate=f"({i}, 0, 0)", rotateXYZ="(0, 0, 0)"), inner="") for i, n in enumerate(names)]
+    joints = [
+        joint(
+            "Revolute", f"rel physics:body0 = </{a}>; rel physics:body1 = </{b}>;" + frames + drive, ("PhysicsDriveAPI:angular",), f"J{b}"
+        )
+        for a, b in zip(names[:-1], names[1:], strict=True)
+    ]
+    model = load(*bodies, *joints)
+    mass = wl.Simulator(model, device="cpu").mass_matrix().numpy()[0]
+    seen = 1 / np.diag(np.linalg.inv(mass))[6:]
+    assert model.drive[6:, 0] == pytest.approx(seen * 180 / math.pi, rel=1e-9)
+    assert model.drive[6:, 2].tolist() == [7, 7]
+    assert (seen < np.diag(mass)[6:]).all()
+
+
+def test_joint_states_place_and_move_what_they_carry():
+    """The first hinge at 90 degrees and 30 degrees/s, the second where the bodies stand: the arm of two turns as one."""
+    state = 'uniform token physics:axis = "Z"; float state:angular:physics:position = 90; float state:angular:physics:velocity = 30;'
+    second = "rel physics:body0 = </A>; rel physics:body1 = </B>; point3f physics:localPos0 = (0.5, 0, 0);"
+    bodies = [body(n, LIGHT + xform(translate=f"({x}, 0, 0)"), inner="") for n, x in (("A", 0.5), ("B", 1.5))]
+    first = "rel physics:body1 = </A>; point3f physics:localPos1 = (-0.5, 0, 0);" + state
+    more = 'point3f physics:localPos1 = (-0.5, 0, 0); uniform token physics:axis = "Z";'
+    model = load(*bodies, joint("Revolute", first, (), "J"), joint("Revolute", second + more, (), "K"))
+    assert model.q0 == pytest.approx([math.pi / 2, 0], abs=1e-12)
+    assert model.v0 == pytest.approx([math.pi / 6, 0], abs=1e-12)
+    pose = wl.Simulator(model, device="cpu").body_pose.numpy()[0]
+    assert pose[:, :3] == pytest.approx(np.array([[0, 0.5, 0], [0, 1.5, 0]]), abs=1e-12)
+    assert model.report.notes[-1].startswith("/J: stand and move at the start as state:<axis>")
+    assert not any("state:" in i.what for i in model.report.ignored)
+
+
+def test_joint_state_of_a_d6_joint_in_centimetres():
+    apis = [f"PhysicsLimitAPI:{axis}" for axis in ("transY", "transZ", "rotX", "rotY")]
+    locked = "".join(limit(axis, 1, -1) for axis in ("transY", "transZ", "rotX", "rotY"))
+    model = load(*pair("", locked + "float state:transX:physics:position = 20; float state:rotZ:physics:position = -30;", apis), head=CM)
+    assert model.q0[7:] == pytest.approx([0.2, -math.pi / 6])
+
+
+def test_what_a_joint_moves_at_the_start_is_told():
+    frames = "point3f physics:localPos0 = (0.5, 0, 0); point3f physics:localPos1 = (-0.5, 0.25, 0);"
+    bodies = [body(n, LIGHT + xform(translate=f"({x}, 0, 0)"), inner="") for n, x in (("A", 0), ("B", 1))]
+    model = load(*bodies, joint("Revolute", JOINT + frames))
+    assert "/B does not stand where joints let them: moved there by 0.25 m" in model.report.notes
