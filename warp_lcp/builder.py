@@ -13,12 +13,14 @@ import numpy as np
 from . import hulls, joints
 from .errors import ModelError, positive_number
 from .joints import AXES, Joint
-from .model import CONTACT_POINTS, JOINT_AXES, DofKind, Drive, Hull, JointType, Material, Mesh, Model, Report, ShapeType
+from .model import CONTACT_POINTS, JOINT_AXES, Combine, DofKind, Drive, Hull, JointType, Material, Mesh, Model, Report, ShapeType
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 NO_LIMIT, NO_DRIVE = (-np.inf, np.inf), (0.0, 0.0, np.inf, 0.0, 0.0)
 MOVED = 1e-5  # from here on it is told that a joint moves a body [m]
 CONTACT_FIELDS = ("normal_stiffness", "normal_damping", "tangent_stiffness", "tangent_damping", "slip_threshold")
+
+COMBINE_FIELDS = ("friction_combine", "restitution_combine")
 
 
 def rotation_matrix(quat: np.ndarray) -> np.ndarray:
@@ -443,6 +445,7 @@ class ModelBuilder:
             friction=np.array([(s.material.static_friction, s.material.dynamic_friction) for s in shapes], dtype=float).reshape(-1, 2),
             contact=np.array([[getattr(s.material, f) for f in CONTACT_FIELDS] for s in shapes], dtype=float).reshape(-1, 5),
             restitution=np.array([s.material.restitution for s in shapes], dtype=float),
+            combine=np.array([[getattr(s.material, f) for f in COMBINE_FIELDS] for s in shapes], dtype=np.int32).reshape(-1, 2),
             pairs=np.zeros((0, 2), dtype=np.int32),
             gravity=self.gravity.copy(),
             up_axis=self.up_axis,
@@ -710,6 +713,8 @@ def _inertia(name: str, value: Sequence[Sequence[float]]) -> np.ndarray:
 def _check_material(name: str, material: Material) -> None:
     for f in fields(material):
         value = getattr(material, f.name)
+        if f.name in COMBINE_FIELDS and value not in tuple(Combine):
+            raise ModelError(f"{name}: {f.name} is {value}; give one of {', '.join(f'Combine.{mode.name}' for mode in Combine)}")
         if value is None:
             continue
         strict = f.name in CONTACT_FIELDS and f.name != "tangent_stiffness" and f.name != "normal_stiffness"

@@ -220,7 +220,7 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
                 continue
             if (name == "slip" and not law.is_cone) or (name in ("hit", "alert") and not model.bodies_meet):
                 continue
-            if name in ("coefficient", "again"):  # for all alike
+            if name in ("coefficient", "combine", "again"):  # for all alike
                 continue
             number = (len(model.shape_body) if model.bounded else 0) if name == "bounds" else 1 if variable.type.ndim == 1 else width
             total += wp.types.type_size_in_bytes(variable.type.dtype) * number

@@ -119,9 +119,18 @@ TABLE_1 = {
 }
 
 
+class Combine(enum.IntEnum):
+    """How a coefficient of two materials becomes that of their pair. Where they differ, the higher one rules, as in PhysX."""
+
+    AVERAGE = 0
+    MIN = 1
+    MULTIPLY = 2
+    MAX = 3
+
+
 @dataclass(frozen=True)
 class Material:
-    """Contact material of a shape. The coefficients of a pair are the average of its two materials.
+    """Contact material of a shape. The coefficients of a pair are the average of its two materials, unless one says otherwise.
 
     Args:
         static_friction: mu_s, limit of the friction force while sticking.
@@ -132,6 +141,7 @@ class Material:
         tangent_damping: b_t [N s/m] of the bristles; None as above.
         slip_threshold: v_s [m/s], the speed from which a contact counts as sliding; None takes Table 1.
         restitution: e, normal speed after an impact over that before it (Newton), 0 to 1; averaged like friction.
+        friction_combine, restitution_combine: how they become those of a pair.
     """
 
     static_friction: float = 0.5
@@ -142,6 +152,8 @@ class Material:
     tangent_damping: float | None = None
     slip_threshold: float | None = None
     restitution: float = 0.0
+    friction_combine: Combine = Combine.AVERAGE
+    restitution_combine: Combine = Combine.AVERAGE
 
 
 @dataclass(frozen=True)
@@ -267,7 +279,8 @@ class Model:
         shape_surface_velocity: [S, 3] m/s in the shape's frame, velocity of the surface relative to the body (belts).
         friction: [S, 2] static and dynamic coefficient.
         contact: [S, 5] k_n, b_n, k_t, b_t, v_s; NaN where the defaults of Table 1 apply.
-        restitution: [S] Newton's e of each material; a pair has the average.
+        restitution: [S] Newton's e of each material; a pair has the average, unless combine says otherwise.
+        combine: [S, 2] :class:`Combine` of friction and of restitution.
         pairs: [P, 2] shapes that may touch, grouped by kind, the lower ShapeType first.
         gravity: [3] m/s^2.
         up_axis: 'Y' or 'Z', for viewers.
@@ -305,6 +318,7 @@ class Model:
     friction: np.ndarray
     contact: np.ndarray
     restitution: np.ndarray
+    combine: np.ndarray
     pairs: np.ndarray
     gravity: np.ndarray
     up_axis: str = "Z"

@@ -17,6 +17,8 @@ Decisions where USD leaves room:
   ``normalDamping``, ``tangentStiffness``, ``tangentDamping`` in mass/time^2 and mass/time, ``slipThreshold`` in
   distance/time) and the velocity of a belt from the collider (``warpLcp:surfaceVelocity``, distance/time along the
   collider prim's axes), all in stage units.
+- So are ``physxMaterial:frictionCombineMode`` and ``restitutionCombineMode`` (average, min, multiply, max; of two that
+  differ the later one rules).
 """
 
 from __future__ import annotations
@@ -38,8 +40,8 @@ import numpy as np
 from . import hulls
 from .builder import ModelBuilder, capsule_solid, rotation_matrix
 from .errors import MissingExtra, ModelError, SceneError
-from .model import Ignored, JointType, Material, Model, Report, ShapeType
-from .usd_attributes import CONTACT_ATTRIBUTES, SURFACE_VELOCITY, unread, written
+from .model import Combine, Ignored, JointType, Material, Model, Report, ShapeType
+from .usd_attributes import COMBINE_ATTRIBUTES, CONTACT_ATTRIBUTES, SURFACE_VELOCITY, unread, written
 from .usd_joints import JointReader, some
 from .usd_shapes import Solid, mesh_solid, round_solid
 
@@ -717,13 +719,22 @@ class _Reader:
             self.notes.append(f"{path}: dynamicFriction {dynamic:g} exceeds staticFriction {static:g}: {dynamic:g} is taken for both")
         bounce = written(api.GetRestitutionAttr().Get())
         material = Material(static_friction=max(static, dynamic), dynamic_friction=dynamic, restitution=bounce)
+        values: dict[str, Any] = {}
+        for name, field in COMBINE_ATTRIBUTES.items():
+            attribute = prim.GetAttribute(name)
+            mode = str(attribute.Get()) if attribute and attribute.HasAuthoredValue() else "average"
+            if mode.upper() in Combine.__members__:
+                values[field] = Combine[mode.upper()]
+            else:
+                why = f"{mode} is none of average, min, multiply, max: average is taken"
+                self._repeat(path, name, why)
         for name, field in CONTACT_ATTRIBUTES.items():
             attribute = prim.GetAttribute(name)
             if attribute and attribute.Get() is not None:
                 self.read_attributes.add(attribute.GetPath())
                 unit = self.length if field == "slip_threshold" else self.mass_unit
-                material = replace(material, **{field: unit * written(attribute.Get())})
-        return material
+                values[field] = unit * written(attribute.Get())
+        return replace(material, **values)
 
     # -- pairs ------------------------------------------------------------------------------------------------------
 

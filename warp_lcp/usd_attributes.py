@@ -15,6 +15,10 @@ CONTACT_ATTRIBUTES = {
     "warpLcp:tangentDamping": "tangent_damping",
     "warpLcp:slipThreshold": "slip_threshold",
 }
+COMBINE_ATTRIBUTES = {
+    "physxMaterial:frictionCombineMode": "friction_combine",
+    "physxMaterial:restitutionCombineMode": "restitution_combine",
+}
 SURFACE_VELOCITY = "warpLcp:surfaceVelocity"
 
 #: Attributes of other engines that change the motion: family -> names (None: all), with the value that has no effect.
@@ -35,7 +39,7 @@ VENDOR_ATTRIBUTES: dict[str, dict[str, Any] | None] = {
     "physxArticulation": {"enabledSelfCollisions": True},
     "physxParticle": None,
     "physxDeformable": None,
-    "physxMaterial": {"frictionCombineMode": "average", "compliantContactStiffness": 0.0, "compliantContactDamping": 0.0},
+    "physxMaterial": {"compliantContactStiffness": 0.0, "compliantContactDamping": 0.0},
     "physxCollision": {"restOffset": 0.0},
     "newton": {
         "contactStiffness": 0.0,
