@@ -795,3 +795,28 @@ def test_combine_mode_that_is_none():
     assert [(i.path, i.what) for i in ignored] == [("/M", "physxMaterial:frictionCombineMode")]
     with pytest.raises(wl.ModelError, match=r"friction_combine is 7; give one of Combine\.AVERAGE"):
         wl.ModelBuilder().add_plane(material=wl.Material(friction_combine=7))
+
+
+# -- articulations that pass through themselves -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "pairs"),
+    [
+        ("", 4),
+        ("bool physxArticulation:enabledSelfCollisions = 0;", 3),
+        ("bool newton:selfCollisionEnabled = 0;", 3),
+        ("bool newton:selfCollisionEnabled = 1; bool physxArticulation:enabledSelfCollisions = 0;", 4),
+    ],
+)
+def test_self_collision_of_an_articulation(content, pairs):
+    """A - B - C in a row, A and C may touch unless the articulation says otherwise; all three touch what stands beside them."""
+    bodies = [body(n, xform(translate=f"({2 * i}, 0, 0)")) for i, n in enumerate("ABC")]
+    ends = [f"rel physics:body0 = </R/{a}>; rel physics:body1 = </R/{b}>;" for a, b in ("AB", "BC")]
+    frames = "point3f physics:localPos0 = (1, 0, 0); point3f physics:localPos1 = (-1, 0, 0);"
+    joints = [prim("PhysicsRevoluteJoint", f"J{i}", (), e + frames) for i, e in enumerate(ends)]
+    root = prim("Xform", "R", ("PhysicsArticulationRootAPI",), content + "".join([*bodies, *joints]))
+    reading = read(root, cube("Ground"))
+    model = reading.builder.finalize()
+    assert len(model.pairs) == pairs
+    assert not reading.report.ignored

@@ -18,7 +18,8 @@ Decisions where USD leaves room:
   distance/time) and the velocity of a belt from the collider (``warpLcp:surfaceVelocity``, distance/time along the
   collider prim's axes), all in stage units.
 - So are ``physxMaterial:frictionCombineMode`` and ``restitutionCombineMode`` (average, min, multiply, max; of two that
-  differ the later one rules).
+  differ the later one rules), and ``newton:selfCollisionEnabled`` or ``physxArticulation:enabledSelfCollisions`` = false
+  of an articulation root, whose bodies then pass through each other.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from . import hulls
 from .builder import ModelBuilder, capsule_solid, rotation_matrix
 from .errors import MissingExtra, ModelError, SceneError
 from .model import Combine, Ignored, JointType, Material, Model, Report, ShapeType
-from .usd_attributes import COMBINE_ATTRIBUTES, CONTACT_ATTRIBUTES, SURFACE_VELOCITY, unread, written
+from .usd_attributes import COMBINE_ATTRIBUTES, CONTACT_ATTRIBUTES, SELF_COLLISION, SURFACE_VELOCITY, unread, written
 from .usd_joints import JointReader, some
 from .usd_shapes import Solid, mesh_solid, round_solid
 
@@ -751,6 +752,21 @@ class _Reader:
         for path, desc in (x for kind in kinds for x in self._descs(kind)):
             for target in desc.filteredCollisions:
                 self._filter_all(self._shapes_of(path), self._shapes_of(target))
+
+        for path, desc in self._descs("Articulation"):
+            if not self._touches_itself(path):
+                own = [s.index for s in self.shapes if s.body and s.body in set(desc.articulatedBodies)]
+                self._filter_all(own, own)
+
+    def _touches_itself(self, root: Any) -> bool:
+        """Whether the bodies of an articulation touch each other; the first attribute that is authored rules."""
+        prim, answer = self.stage.GetPrimAtPath(root), True
+        for name in reversed(SELF_COLLISION):
+            attribute = prim.GetAttribute(name)
+            if attribute and attribute.HasAuthoredValue():
+                self.read_attributes.add(attribute.GetPath())
+                answer = bool(attribute.Get())
+        return answer
 
     def _groups_apart(self) -> set[frozenset[Any]]:
         """Pairs of collision groups that do not collide (one group: its members among themselves).

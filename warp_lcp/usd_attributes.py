@@ -19,6 +19,7 @@ COMBINE_ATTRIBUTES = {
     "physxMaterial:frictionCombineMode": "friction_combine",
     "physxMaterial:restitutionCombineMode": "restitution_combine",
 }
+SELF_COLLISION = ("newton:selfCollisionEnabled", "physxArticulation:enabledSelfCollisions")
 SURFACE_VELOCITY = "warpLcp:surfaceVelocity"
 
 #: Attributes of other engines that change the motion: family -> names (None: all), with the value that has no effect.
@@ -75,7 +76,7 @@ def unread(prim: Any, read: set[Any]) -> list[tuple[str, str]]:
             stray = name.count(":") == 1 and name not in defined and not isinstance(attribute.Get(), str)
             if stray and not _neutral(attribute.Get()):
                 families.setdefault("physics", []).append(name)
-        elif _changes_motion(name, attribute):
+        elif attribute.GetPath() not in read and _changes_motion(name, attribute):
             families.setdefault(family, []).append(name)
     for family, names in families.items():
         if family == "physics":
