@@ -179,6 +179,7 @@ class ModelBuilder:
         loop: bool = False,
         collide: bool = False,
         name: str | None = None,
+        axis_names: Sequence[str] | None = None,
     ) -> int:
         """Join two bodies and return the joint's index.
 
@@ -199,7 +200,7 @@ class ModelBuilder:
             start_velocity: of each coordinate; omitted or NaN: what the velocities of the bodies leave for it.
             loop: never carry the child by this joint, hold both bodies where they are.
             collide: let the shapes of the two bodies touch, and those of what hangs rigidly on them.
-            name: 'joint<i>' if omitted.
+            name: 'joint<i>' if omitted. axis_names: of each coordinate; the joint's if omitted.
 
         Raises:
             ModelError: for a joint that is none, or a number that is not finite or negative.
@@ -244,6 +245,7 @@ class ModelBuilder:
                 start=None if start is None else _start(f"{name}: start", start, 4 if type is JointType.SPHERICAL else n),
                 start_velocity=None if start_velocity is None else _start(f"{name}: start velocity", start_velocity, n),
                 acceleration=by_inertia,
+                names=None if axis_names is None else tuple(axis_names),
             )
         )
         return len(self._joints) - 1
@@ -422,13 +424,17 @@ class ModelBuilder:
             raise ModelError("nothing can move: the scene has no free and no kinematic body; add one (in USD: PhysicsRigidBodyAPI)")
         mass, com, inertia = (np.array(x) for x in zip(*(self._mass_properties(i) for i in range(len(self._bodies))), strict=True))
         shapes = self._shapes
-        forest, moved = self._forest(mass, com, inertia)
+        forest, moved, loops = self._forest(mass, com, inertia)
         report = Report() if report is None else report
         if moved:
             far, worst = max(moved)
             what = f"{len(moved)} bodies do" if len(moved) > 1 else f"{worst} does"
             which = f", {worst} by {far:.3g} m" if len(moved) > 1 else f" by {far:.3g} m"
             report = replace(report, notes=(*report.notes, f"{what} not stand where joints let them: moved there{which}"))
+        lost = [joint.name for joint in loops if joint.distance is None and _acts(joint)]
+        if lost:
+            what = "limits, drive, damping and dry friction act only on joints that carry a body"
+            report = replace(report, notes=(*report.notes, *(f"{name}: closes a loop: its {what}" for name in lost)))
         model = Model(
             body_names=tuple(b.name for b in self._bodies),
             **forest,
@@ -453,9 +459,11 @@ class ModelBuilder:
         )
         return replace(model, pairs=self._pairs(model))
 
-    def _forest(self, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray) -> tuple[dict[str, Any], list[tuple[float, str]]]:
+    def _forest(
+        self, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray
+    ) -> tuple[dict[str, Any], list[tuple[float, str]], list[Joint]]:
         """Model's fields of bodies, joints and coordinates, which are in the order of the tree, parents first; what joints move at the
-        start although they have no coordinate for it, by how much [m]."""
+        start although they have no coordinate for it, by how much [m]; joints that close loops."""
         bodies, count = self._bodies, len(self._bodies)
         carried, order, loops = joints.forest([b.name for b in bodies], [b.joint for b in bodies], self._joints)
         carries = {joint.parent for joint in carried if joint is not None}
@@ -471,6 +479,7 @@ class ModelBuilder:
         q0: list[np.ndarray] = []
         v0: list[np.ndarray] = []
         dofs: list[tuple[Any, ...]] = []
+        joint_names, dof_names = [""] * count, list[str]()
         axes: list[np.ndarray] = []  # [6, n] of each body's velocities, at the world's origin
         by_inertia: list[int] = []  # drives that ask for accelerations
         moved: list[tuple[float, str]] = []
@@ -486,6 +495,7 @@ class ModelBuilder:
                 kind = DofKind.FREE if body.joint is JointType.FREE else DofKind.PRESCRIBED
                 q0.append(body.pose)
                 v0.append(np.r_[body.velocity, body.angular_velocity])
+                dof_names += [body.name] * 6
                 dofs += [(b, kind, np.eye(3)[k % 3], 0.0, 0.0, 0.0, NO_LIMIT, NO_DRIVE) for k in range(6)]
                 centre = body.pose[:3] + joints.rotate(body.pose[3:], com[b])
                 turns = np.r_[np.cross(centre, np.eye(3)).T, np.eye(3)]
@@ -525,6 +535,7 @@ class ModelBuilder:
             axes.append(columns)
             if joint.acceleration is not None:
                 by_inertia += (len(dofs) + np.flatnonzero(joint.acceleration)).tolist()
+            joint_names[b], dof_names = joint.name, [*dof_names, *(joint.names or [joint.name] * len(axis))]
             numbers = (joint.armature, joint.damping, joint.friction, joint.limit, joint.drive)
             dofs += list(zip([b] * len(axis), joints.kinds(joint), axis, *numbers, strict=True))
         columns_of = list(zip(*dofs, strict=True))
@@ -534,24 +545,30 @@ class ModelBuilder:
             matrix = joints.mass_matrix(parents, order, owner, np.concatenate(axes, axis=1), poses, mass, com, inertia)
             matrix[np.diag_indices(len(owner))] += armature
             drive[by_inertia, :2] /= np.linalg.inv(matrix)[by_inertia, by_inertia, None]
-        return {
-            "body_parent": parents,
-            "joint_type": np.array(types, dtype=np.int32),
-            "joint_pose": frames,
-            "joint_child_pose": child_frames,
-            **starts,
-            "q0": np.concatenate(q0),
-            "v0": np.concatenate(v0),
-            "dof_body": np.array(columns_of[0], dtype=np.int32),
-            "dof_kind": np.array(columns_of[1], dtype=np.int32),
-            "dof_axis": np.array(columns_of[2], dtype=float),
-            "armature": np.array(columns_of[3], dtype=float),
-            "damping": np.array(columns_of[4], dtype=float),
-            "joint_friction": np.array(columns_of[5], dtype=float),
-            "limit": np.array(columns_of[6], dtype=float).reshape(-1, 2),
-            "drive": drive,
-            "loops": tuple(joints.loop_of(joint) for joint in loops),
-        }, moved
+        return (
+            {
+                "body_parent": parents,
+                "joint_names": tuple(joint_names),
+                "dof_names": tuple(dof_names),
+                "joint_type": np.array(types, dtype=np.int32),
+                "joint_pose": frames,
+                "joint_child_pose": child_frames,
+                **starts,
+                "q0": np.concatenate(q0),
+                "v0": np.concatenate(v0),
+                "dof_body": np.array(columns_of[0], dtype=np.int32),
+                "dof_kind": np.array(columns_of[1], dtype=np.int32),
+                "dof_axis": np.array(columns_of[2], dtype=float),
+                "armature": np.array(columns_of[3], dtype=float),
+                "damping": np.array(columns_of[4], dtype=float),
+                "joint_friction": np.array(columns_of[5], dtype=float),
+                "limit": np.array(columns_of[6], dtype=float).reshape(-1, 2),
+                "drive": drive,
+                "loops": tuple(joints.loop_of(joint) for joint in loops),
+            },
+            moved,
+            loops,
+        )
 
     @property
     def welded(self) -> set[int]:
@@ -639,6 +656,11 @@ def _axes(name: str, given: tuple[Any, ...]) -> tuple[tuple[str, ...], np.ndarra
     if not length.all() or len(given) > 6:
         raise ModelError(f"{name}: axes are {given}; give six at most, none of no length")
     return tuple(kind for kind, _ in given), vectors / length[:, None]
+
+
+def _acts(joint: Joint) -> bool:
+    """Does anything but what it holds act along the joint?"""
+    return bool(np.isfinite(joint.limit).any() or joint.drive[:, :2].any() or joint.damping.any() or joint.friction.any())
 
 
 def _start(what: str, value: float | Sequence[float], n: int) -> np.ndarray:

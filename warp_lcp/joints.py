@@ -24,7 +24,7 @@ class Joint:
 
     ``directions`` [n, 3]: where the axes lie in the frame; ``axes`` are then "t" and "r". None: where their names say.
     ``start``, ``start_velocity``: coordinates at the start and their velocities; None or NaN: those nearest to what the bodies do.
-    ``acceleration`` [n]: which drives have gains for each kg or kg m^2 that the joint sees.
+    ``acceleration`` [n]: which drives have gains for each kg or kg m^2 that the joint sees. ``names`` [n]: of the axes, None: the joint's.
     """
 
     name: str
@@ -46,6 +46,7 @@ class Joint:
     start: np.ndarray | None = None
     start_velocity: np.ndarray | None = None
     acceleration: np.ndarray | None = None
+    names: tuple[str, ...] | None = None
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -246,7 +247,9 @@ def turned(joint: Joint) -> Joint:
     """The same joint followed back: coordinates keep their signs (a ball's turns the other way), not their order."""
     if (len(joint.axes) > 1 or joint.directions is not None) and joint.type is not JointType.SPHERICAL:
         per_axis = {n: getattr(joint, n)[::-1] for n in ("armature", "damping", "friction", "limit", "drive")}
-        per_axis |= {n: None if getattr(joint, n) is None else getattr(joint, n)[::-1] for n in ("start", "start_velocity", "acceleration")}
+        per_axis |= {
+            n: None if getattr(joint, n) is None else getattr(joint, n)[::-1] for n in ("start", "start_velocity", "acceleration", "names")
+        }
         return replace(
             joint,
             type=JointType.D6,

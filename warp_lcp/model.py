@@ -257,11 +257,12 @@ class Model:
     Attributes:
         body_names: name or prim path of each body.
         body_parent: [B] index of the parent body, -1 = world.
-        joint_type: [B] :class:`JointType` of the joint above each body.
+        joint_type: [B] :class:`JointType` of the joint above each body. joint_names: [B] its name, empty where it is none of the scene's.
         joint_pose: [B, 7] frame of that joint in the parent's frame (identity under a FREE or KINEMATIC joint).
         joint_child_pose: [B, 7] frame of that joint in the body's own frame (likewise).
         q_start, v_start: [B] first coordinate of each body in q and v.
         q0: [nq] initial configuration. v0: [nv] initial velocity.
+        dof_names: [nv] joint of each velocity, of several that were made one its own; body, where no joint of the scene carries it.
         dof_body: [nv] body above which each velocity is. dof_kind: [nv] :class:`DofKind`. dof_axis: [nv, 3] in the joint's frame.
         armature: [nv] kg or kg m^2, added to the mass matrix. damping: [nv] N s/m or N m s, force by joint velocity.
         joint_friction: [nv] N or N m, dry friction. limit: [nv, 2] m or rad, least and greatest coordinate, infinite where there is none.
@@ -289,6 +290,7 @@ class Model:
 
     body_names: tuple[str, ...]
     body_parent: np.ndarray
+    joint_names: tuple[str, ...]
     joint_type: np.ndarray
     joint_pose: np.ndarray
     joint_child_pose: np.ndarray
@@ -296,6 +298,7 @@ class Model:
     v_start: np.ndarray
     q0: np.ndarray
     v0: np.ndarray
+    dof_names: tuple[str, ...]
     dof_body: np.ndarray
     dof_kind: np.ndarray
     dof_axis: np.ndarray

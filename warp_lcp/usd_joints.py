@@ -221,6 +221,7 @@ class JointReader:
                 reader.builder.add_joint(JointType.SPHERICAL, parent, child, **options, **part[0].options)
             else:
                 back = inverse(np.r_[np.zeros(3), frame[3:]])[3:]
+                options["axis_names"] = [axis.name for axis in part]
                 options["axes"] = [(axis.letter, rotate(back, axis.direction)) for axis in part]
                 for name in ("armature", "damping", "friction", "limit", "drive", "start", "start_velocity"):
                     options[name] = [axis.options.get(name, DEFAULTS[name]) for axis in part]
