@@ -5,11 +5,12 @@ import math
 
 import numpy as np
 import pytest
-from test_usd import BODY, CM, JOINT, MASS, SI, body, cube, layer, load, needs_shared, prim, read, refused, stage, xform  # noqa: F401
+from test_usd import BODY, CM, JOINT, MASS, SCENE, SI, body, cube, layer, load, needs_shared, prim, read, refused, stage, xform  # noqa: F401
 
 import warp_lcp as wl
 from warp_lcp import JointType
 from warp_lcp.joints import compose, inverse, rotate
+from warp_lcp.usd import read_usd
 
 pytest.importorskip("pxr", reason="needs the extra 'usd'")
 
@@ -393,3 +394,162 @@ def test_what_a_joint_moves_at_the_start_is_told():
     bodies = [body(n, LIGHT + xform(translate=f"({x}, 0, 0)"), inner="") for n, x in (("A", 0), ("B", 1))]
     model = load(*bodies, joint("Revolute", JOINT + frames))
     assert "/B does not stand where joints let them: moved there by 0.25 m" in model.report.notes
+
+
+def test_bodies_of_a_stack_pass_through_each_other_with_a_body_between_them():
+    boxes = [body("A", LIGHT, inner=cube()), body("B", LIGHT + xform(translate="(1, 0, 0)"), inner=cube())]
+    for more, pairs in (("", 0), ("bool physics:collisionEnabled = 1;", 1)):
+        hinges = []
+        for name, x in (("h1", 0.25), ("h2", 0.75)):
+            frames = (
+                f'point3f physics:localPos0 = ({x}, 0, 0); point3f physics:localPos1 = ({x - 1}, 0, 0); uniform token physics:axis = "Z";'
+            )
+            hinges.append(joint("Revolute", ENDS + frames + more, (), name))
+        assert len(load(root(*boxes, *hinges)).pairs) == pairs
+
+
+# -- where joints stand: every kind of prim that one may name ------------------------------------------------------------
+
+TURN = np.array([0.2, -0.4, 0.4, 0.8])  # (x y z w)
+PLACE = (0.3, -0.2, 0.5)
+FRAME = f"point3f physics:localPos1 = {PLACE}; quatf physics:localRot1 = (0.8, 0.2, -0.4, 0.4);"
+MOVED = {"translate": "(1, 2, 3)", "rotateXYZ": "(10, 20, 30)"}
+SIMPLE = xform(translate="(0.3, 0, 1)", rotateXYZ="(50, 0, 0)")
+
+
+def world_frame(source, path):
+    """Where FRAME of a prim is in the world, by USD's own transform, and the image of its x axis (stage units)."""
+    from pxr import UsdGeom
+
+    matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(source.GetPrimAtPath(path)))
+    return np.array(PLACE) @ matrix[:3, :3] + matrix[3, :3], rotate(TURN, np.eye(3)[0]) @ matrix[:3, :3]
+
+
+@pytest.mark.parametrize("head", [SI, CM])
+@pytest.mark.parametrize("scale", [None, "(2, 2, 2)", "(2, 3, 0.5)", "(-1, 1, 1)", "(-2, -2, -2)"])
+@pytest.mark.parametrize("case", ["body", "child", "nested body", "body below"])
+def test_frame_of_a_joint_is_where_the_prim_that_it_names_has_it(case, scale, head):
+    """Scaled, slanted, mirrored (which turns angles round), child prims, nested bodies; metres and centimetres."""
+    outer = xform(**MOVED, **({} if scale is None else {"scale": scale}))
+    prims, named = {
+        "body": (body("A", LIGHT + outer, inner=""), "/A"),
+        "child": (body("A", LIGHT + outer, inner=prim("Xform", "K", (), SIMPLE)), "/A/K"),
+        "nested body": (body("A", LIGHT + outer, inner=body("B", LIGHT + SIMPLE, inner="")), "/A/B"),
+        "body below": (prim("Xform", "W", (), outer + body("B", LIGHT + SIMPLE, inner="")), "/W/B"),
+    }[case]
+    source = stage(SCENE, prims, joint("Revolute", f"rel physics:body1 = <{named}>;" + FRAME), head=head)
+    reading = read_usd(source)
+    model = reading.builder.finalize()
+    b = next(b for b in range(model.num_bodies) if model.joint_type[b] == JointType.REVOLUTE)
+    path = model.body_names[b]
+    stands = np.array(reading.builder.pose(b))
+    frame = compose(stands, model.joint_child_pose[b])
+    place, axis = world_frame(source, named)
+    unit = 0.01 if head == CM else 1.0
+    assert frame[:3] == pytest.approx(unit * place, abs=1e-12)
+    if scale != "(2, 3, 0.5)":  # an uneven scale leaves no axis where it is
+        mirrored = -1.0 if scale and "-" in scale else 1.0
+        assert rotate(frame[3:], np.eye(3)[0]) == pytest.approx(mirrored * axis / np.linalg.norm(axis), abs=1e-6)
+    assert path == ("/A" if case == "child" else named)
+
+
+def test_joint_that_names_what_is_no_body_holds_to_the_world_there():
+    static = prim("Xform", "S", (), xform(translate="(5, 0, 0)", rotateXYZ="(0, 0, 90)", scale="(2, 2, 2)"))
+    ends = "rel physics:body0 = </S>; rel physics:body1 = </A>; point3f physics:localPos0 = (1, 0, 0);"
+    model = load(static, body("A", LIGHT + xform(translate="(5, 2, 0)", rotateXYZ="(0, 0, 90)"), inner=""), joint("Revolute", ends))
+    assert model.joint_pose[0] == pytest.approx([5, 2, 0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)], abs=1e-12)
+    assert (model.nq, model.q0[0]) == (1, pytest.approx(0, abs=1e-12))
+
+
+def test_joint_of_a_disabled_body_holds_to_the_world():
+    off = body("B", LIGHT + "bool physics:rigidBodyEnabled = 0;" + xform(translate="(0, 0, 2)"), inner="")
+    model = load(body("A", LIGHT, inner=""), off, joint("Revolute", JOINT + "point3f physics:localPos1 = (0, 0, -2);"))
+    assert (model.dofs, model.joint_pose[0, :3].tolist()) == (1, pytest.approx([0, 0, 0]))
+
+
+def test_joint_that_names_nothing_is_refused():
+    message = refused(body("A", LIGHT, inner=""), joint("Revolute", "rel physics:body0 = </Nope>; rel physics:body1 = </A>;"))
+    assert "/J: physics:body0 names /Nope, which does not exist" in message
+
+
+def test_robots_of_instances_and_their_joints():
+    """Two instances of one robot, 5 apart: each has bodies, joint and articulation of its own, which passes through itself alone."""
+    arms = [body(n, LIGHT + xform(translate=f"({x}, 0, 0)"), inner=cube()) for n, x in (("A", 0), ("B", 1), ("C", 2))]
+    ends = [f"rel physics:body0 = </R/{a}>; rel physics:body1 = </R/{b}>;" for a, b in ("AB", "BC")]
+    frames = "point3f physics:localPos0 = (0.5, 0, 0); point3f physics:localPos1 = (-0.5, 0, 0);"
+    hinges = [joint("Revolute", e + frames, (), n) for n, e in zip(("J", "K"), ends, strict=True)]
+    robot = prim("Xform", "R", ("PhysicsArticulationRootAPI",), "bool newton:selfCollisionEnabled = 0;" + "".join([*arms, *hinges]))
+    copies = [
+        prim("Xform", n, (), xform(translate=f"({x}, 0, 0)"), "instanceable = true\nprepend inherits = </R>")
+        for n, x in (("I", 0), ("K", 5))
+    ]
+    model = load(robot.replace("def Xform", "class Xform", 1), *copies)
+    assert model.joint_names == ("", "/I/J", "/I/K", "", "/K/J", "/K/K")
+    assert model.body_parent.tolist() == [-1, 0, 1, -1, 3, 4]
+    poses = wl.Simulator(model, device="cpu").body_pose.numpy()[0]
+    assert poses[:, 0] == pytest.approx([0, 1, 2, 5, 6, 7])
+    touching = {tuple(sorted(model.shape_body[pair])) for pair in model.pairs}
+    assert touching == {(a, b) for a in range(3) for b in range(3, 6)}
+
+
+def test_joints_in_grams_and_centimetres():
+    """Units of mass and length in armature, damping, friction, drives: g cm^2, g cm^2/s by degree, g cm^2/s^2."""
+    head = CM.replace("kilogramsPerUnit = 1", "kilogramsPerUnit = 0.001")
+    content = "float newton:armature = 3; float newton:damping = 2; float newton:friction = 5; float drive:angular:physics:stiffness = 7;"
+    model = load(*pair("Revolute", content + "float drive:angular:physics:maxForce = 11;", ("PhysicsDriveAPI:angular",)), head=head)
+    unit = 1e-3 * 1e-4
+    found = [model.armature[6], model.damping[6], model.joint_friction[6], model.drive[6, 0], model.drive[6, 2]]
+    assert found == pytest.approx([3 * unit, 2 * unit * 180 / math.pi, 5 * unit, 7 * unit * 180 / math.pi, 11 * unit], rel=1e-9)
+    content = content.replace("angular", "linear")
+    model = load(*pair("Prismatic", content + "float drive:linear:physics:maxForce = 11;", ("PhysicsDriveAPI:linear",)), head=head)
+    found = [model.armature[6], model.damping[6], model.joint_friction[6], model.drive[6, 0], model.drive[6, 2]]
+    assert found == pytest.approx([3e-3, 2e-3, 5e-5, 7e-3, 11e-5], rel=1e-9)
+
+
+def test_what_is_lost_where_a_joint_closes_a_loop_is_told():
+    closes = joint("Revolute", JOINT + "bool physics:excludeFromArticulation = 1; float physics:upperLimit = 10;", name="K")
+    assert any(note.startswith("/K: closes a loop: its limits") for note in load(*pair("Revolute"), closes).report.notes)
+
+
+def test_a_joint_of_several_axes_may_carry_its_first_body():
+    """Only its second body is held: poses and mass matrix are those of the same joint with its bodies exchanged, coordinates reversed."""
+    content = LIGHT + xform(translate="(1, 0, 0)")
+    free = [f"PhysicsLimitAPI:{axis}" for axis in ("transX", "transY", "transZ", "rotZ")]
+    locked = "".join(limit(axis, 1, -1) for axis in ("transX", "transY", "transZ", "rotZ")) + limit("rotY", -20, 30)
+    ends = "rel physics:body0 = </A>; point3f physics:localPos1 = (1, 0, 0);"
+    model = load(body("A", content, inner=""), joint("", ends + locked, (*free, "PhysicsLimitAPI:rotY")))
+    assert model.dofs == 2
+    assert model.limit[0] == pytest.approx(np.radians([-20, 30]))
+    sim, (a, b) = wl.Simulator(model, device="cpu"), (0.3, -0.4)  # about y, then about x: the world turns by R_x(b) R_y(a) in A
+    sim.q.assign(np.array([[a, b]]))
+    pose = sim.body_pose.numpy()[0, 0]
+    x, y = np.array([math.sin(b / 2), 0, 0, math.cos(b / 2)]), np.array([0, math.sin(a / 2), 0, math.cos(a / 2)])
+    assert pose == pytest.approx(inverse(compose(np.r_[0, 0, 0, x], np.r_[0, 0, 0, y])) + np.eye(7)[0], abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["Revolute", "Prismatic"])
+@pytest.mark.parametrize(("limits", "expected"), [({"upper": 10}, (-np.inf, 10)), ({"lower": -10}, (-10, np.inf)), ({}, (-np.inf, np.inf))])
+def test_limits_on_one_side(kind, limits, expected):
+    """The parser enables no limit of an angle that has one side."""
+    content = "".join(f"float physics:{side}Limit = {value};" for side, value in limits.items())
+    unit = math.radians(1) if kind == "Revolute" else 1.0
+    assert load(*pair(kind, content)).limit[6] == pytest.approx(unit * np.array(expected))
+
+
+def test_infinite_limits_that_lock():
+    apis = [f"PhysicsLimitAPI:{axis}" for axis in ("transX", "rotX")]
+    model = load(*pair("", limit("transX", "inf", "-inf") + limit("rotX", -10, "inf"), apis))
+    assert model.dofs == 11
+    assert model.limit[8] == pytest.approx([-math.radians(10), np.inf])  # after ty and tz
+
+
+def test_each_cone_limit_breaking_and_mimic_joint_is_named():
+    one = read(*pair("Spherical", "float physics:coneAngle1Limit = 30;")).report.ignored
+    assert [(i.path, i.what.split()[0]) for i in one] == [("/J", "cone")]
+    mimic = "rel newton:mimicJoint = </K>; float newton:mimicCoef1 = 2;"
+    ignored = read(*pair("Revolute", mimic, ("NewtonMimicAPI",))).report.ignored
+    assert [(i.path, i.what) for i in ignored] == [("/J", "NewtonMimicAPI")]
+    ignored = read(*pair("Revolute", "", ("PhysxMimicJointAPI:rotX",))).report.ignored
+    assert [(i.path, i.what) for i in ignored] == [("/J", "PhysxMimicJointAPI:rotX")]
+    ignored = read(*pair("Revolute", "float physics:breakTorque = 3;")).report.ignored
+    assert [(i.path, i.what) for i in ignored] == [("/J", "physics:breakForce, physics:breakTorque")]

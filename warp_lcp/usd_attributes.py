@@ -56,8 +56,20 @@ VENDOR_ATTRIBUTES: dict[str, dict[str, Any] | None] = {
         "selfCollisionEnabled": True,
         "jointsAddMobility": False,
     },
-    "mjc": {"solref": None, "solimp": None, "condim": 3, "priority": 0, "solmix": 1.0, "gravcomp": 0.0, "margin": 0.0, "inertia": ""},
+    "mjc": {
+        "stiffness": 0.0,
+        "solref": None,
+        "solimp": None,
+        "condim": 3,
+        "priority": 0,
+        "solmix": 1.0,
+        "gravcomp": 0.0,
+        "margin": 0.0,
+        "inertia": "",
+    },
 }
+#: Applied schemas that couple joints: beginnings of their names, which need not be registered.
+COUPLINGS = ("NewtonMimicAPI", "PhysxMimicJointAPI", "MjcEquality")
 VENDOR_NAMES = {"physx": "PhysX", "newton": "Newton", "mjc": "MuJoCo"}
 
 
@@ -78,6 +90,10 @@ def unread(prim: Any, read: set[Any]) -> list[tuple[str, str]]:
                 families.setdefault("physics", []).append(name)
         elif attribute.GetPath() not in read and _changes_motion(name, attribute):
             families.setdefault(family, []).append(name)
+    schemas = prim.GetMetadata("apiSchemas")
+    for schema in schemas.GetAppliedItems() if schemas else ():
+        if schema.startswith(COUPLINGS):
+            entries.append((schema, "joints that follow others are not supported yet: the joint moves by itself"))
     for family, names in families.items():
         if family == "physics":
             why = "no schema applied to this prim has it, so USD does not read it; apply PhysicsMassAPI, PhysicsRigidBodyAPI, ..."

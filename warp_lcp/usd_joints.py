@@ -125,18 +125,26 @@ class JointReader:
     def _sides(self, path: Any, desc: Any, prim: Any) -> tuple[list[int], list[np.ndarray]] | None:
         """Bodies (-1 = world) and frames of a joint that is one."""
         reader = self.reader
-        sides = [(desc.body0, desc.localPose0Position, desc.localPose0Orientation)]
-        sides.append((desc.body1, desc.localPose1Position, desc.localPose1Orientation))
-        bodies = [self._body(body) for body, _, _ in sides]
+        bodies = [self._body(body) for body in (desc.body0, desc.body1)]
+        schema = reader.px.UsdPhysics.Joint(prim)
+        for relation, found in ((schema.GetBody0Rel(), desc.rel0), (schema.GetBody1Rel(), desc.rel1)):
+            missing = [t for t in relation.GetTargets() if not reader.stage.GetPrimAtPath(t)]
+            if missing:
+                raise ModelError(
+                    f"{path}: {relation.GetName()} names {missing[0]}, which does not exist; mend it, or clear it for the world"
+                )
+            if len(relation.GetTargets()) > 1:
+                reader.notes.append(f"{path}: {relation.GetName()} names several prims: {found} is taken")
         if bodies[0] == bodies[1]:
-            where = "the world to the world" if bodies[0] < 0 else f"{sides[0][0]} to itself"
+            where = "the world to the world" if bodies[0] < 0 else f"{desc.body0} to itself"
             reader._repeat(path, str(prim.GetTypeName()), f"it joins {where}: nothing is held")
             return None
         if any(body < -1 for body in bodies):
             return None  # refused with its body
         if min(desc.breakForce, desc.breakTorque) < 1e30:
             reader._repeat(path, "physics:breakForce, physics:breakTorque", "joints do not break here")
-        return bodies, [self._frame(position, turn) for _, position, turn in sides]
+        first = self._frame(desc.rel0, desc.body0, schema.GetLocalPos0Attr().Get(), schema.GetLocalRot0Attr().Get())
+        return bodies, [first, self._frame(desc.rel1, desc.body1, schema.GetLocalPos1Attr().Get(), schema.GetLocalRot1Attr().Get())]
 
     def _joint(self, path: Any, desc: Any, kind: str, prim: Any) -> None:
         reader, sides = self.reader, self._sides(path, desc, prim)
@@ -165,7 +173,8 @@ class JointReader:
             raise ModelError(f"{path}: joints of this type are not supported; use a joint of UsdPhysics")
 
     def _ball(self, path: Any, desc: Any, prim: Any) -> dict[str, Any]:
-        if desc.limit.enabled:
+        schema = self.reader.px.UsdPhysics.SphericalJoint(prim)
+        if max(schema.GetConeAngle0LimitAttr().Get(), schema.GetConeAngle1LimitAttr().Get()) >= 0.0:
             self.reader._repeat(path, "cone limit (physics:coneAngle0Limit, coneAngle1Limit)", "not supported yet: the joint turns freely")
         return self._attributes(prim, "rrr")
 
@@ -201,14 +210,14 @@ class JointReader:
             where = where if where.size else pose
             axes.append(_Axis(str(path), letter, frames[0], sign * rotate(frames[0][3:], np.eye(3)[0]), own))
             collide = collide or desc.collisionEnabled
-        if not axes:
-            frame = self._frame(members[0][1].localPose0Position, members[0][1].localPose0Orientation)
-            raise ModelError(
-                f"{first}: all joints that add their mobilities here are locked at {frame[:3].tolist()}; use a PhysicsFixedJoint"
-            )
+        if not axes:  # all are locked
+            reader.builder.add_joint(JointType.FIXED, *bodies, parent_frame=frames[0], child_frame=frames[1], name=str(first))
+            return
         self._check_rank(first, axes)
         reader.notes.append(f"{some([axis.name for axis in axes])}: act one after the other ({ADDS})")
         parts = _parts(axes)
+        if len(parts) > 1 and not collide and min(ends) >= 0:  # the builder knows of no joint between the two
+            reader._filter_all(*(reader._shapes_of(body) for body in (members[0][1].body0, members[0][1].body1)))
         parent, parent_pose = ends[0], np.r_[np.zeros(6), 1.0]
         for k, (part, centre) in enumerate(parts):
             child = ends[1]
@@ -247,12 +256,12 @@ class JointReader:
         angular = kind == "RevoluteJoint"
         turn = np.array(ALONG[str(desc.axis).rpartition(".")[2]])
         frames = [np.r_[frame[:3], multiply(frame[3:], turn)] for frame in frames]
-        if desc.limit.enabled and desc.limit.lower > desc.limit.upper:
+        if desc.limit.lower > desc.limit.upper:
             self.reader.notes.append(f"{path}: its lower limit is above its upper one: locked")
             return frames, None
         unit = math.radians(1.0) if angular else self.reader.length
         own: dict[str, Any] = {"drive": self._drive(path, desc.drive, angular)}
-        if desc.limit.enabled:
+        if min(abs(desc.limit.lower), abs(desc.limit.upper)) < math.inf:  # the parser enables no limit of an angle on one side
             own["limit"] = (unit * written(desc.limit.lower), unit * written(desc.limit.upper))
         own |= self._attributes(prim, "r" if angular else "t")
         position, velocity = self._state(prim, "angular" if angular else "linear", angular)
@@ -264,12 +273,11 @@ class JointReader:
         for dof, limit in _by_axis(desc.jointLimits):
             if dof not in DOFS:
                 self.reader._repeat(path, "limit of the distance", "not supported on a D6 joint; use a distance joint")
-            elif limit.enabled:
+            elif limit.lower > limit.upper:
+                free.pop(DOFS[dof])
+            else:
                 unit = math.radians(1.0) if dof.startswith("Rot") else self.reader.length
-                if limit.lower > limit.upper:
-                    free.pop(DOFS[dof])
-                else:
-                    free[DOFS[dof]] = (unit * written(limit.lower), unit * written(limit.upper))
+                free[DOFS[dof]] = (unit * written(limit.lower), unit * written(limit.upper))
         drives: dict[str, Drive | None] = {}
         for dof, drive in _by_axis(desc.jointDrives):
             if dof in DOFS and DOFS[dof] in free:
@@ -296,10 +304,26 @@ class JointReader:
             return -1
         return self.reader.bodies[path].index if path in self.reader.bodies else -2
 
-    def _frame(self, position: Any, turn: Any) -> np.ndarray:
-        """(x y z qx qy qz qw), m."""
-        quat = np.array([*turn.GetImaginary(), turn.GetReal()], dtype=float)
-        return np.r_[self.reader.length * np.array([written(x) for x in position]), quat / np.linalg.norm(quat)]
+    def _frame(self, prim: Any, body: Any, position: Any, turn: Any) -> np.ndarray:
+        """Of one side in its body's frame or the world, from that of the prim that the joint names (x y z qx qy qz qw), m.
+
+        The parser's own is in single precision, and beside the prim where uneven scales above a rotation slant it.
+        """
+        reader = self.reader
+        quat = np.array([*(written(x) for x in turn.GetImaginary()), written(turn.GetReal())])
+        pose = np.r_[[written(x) for x in position], quat / np.linalg.norm(quat) if quat.any() else [0.0, 0.0, 0.0, 1.0]]
+        if prim:
+            named = reader._frame(prim)
+            own = reader.bodies[body].frame if body in reader.bodies else None
+            if own is not None and prim == body:
+                pose[:3] = own.rotation.T @ own.linear @ pose[:3]
+            else:
+                place = np.r_[named.position, reader._quaternion(named.rotation)]
+                pose = np.r_[named.position + named.linear @ pose[:3], multiply(place[3:], pose[3:])]
+                if own is not None:
+                    pose = compose(inverse(np.r_[own.position, reader._quaternion(own.rotation)]), pose)
+        pose[:3] *= reader.length
+        return pose
 
     def _gain(self, angular: bool) -> float:
         """Unit of a drive's stiffness or damping."""
