@@ -316,7 +316,13 @@ class Simulator:
             if present is None or present.shape != (rows[name], pairs):
                 setattr(p, name, wp.empty((rows[name], pairs), dtype=dtype, device=self.device))
                 self._graphs.clear()
-        wp.launch(self._kernels.combine_pairs, dim=(max(rows.values()), pairs), inputs=[self.topology, p], device=self.device)
+        inputs = [self.topology, p, self._combine(0)]
+        wp.launch(self._kernels.combine_pairs, dim=(max(rows.values()), pairs), inputs=inputs, device=self.device)
+
+    def _combine(self, which: int) -> wp.array:
+        """[P] how the friction (0) or restitution (1) of a pair's two materials becomes one; none where all take the mean."""
+        modes = self.model.combine[self.model.pairs, which].max(axis=1, initial=0)
+        return self.ints(modes if modes.any() else [])
 
     def _set_constant(self, bundle: Any, name: str, value: np.ndarray) -> None:
         present = getattr(bundle, name)
@@ -334,7 +340,7 @@ class Simulator:
             k = restitution.make(self.real)
             self._kernels.bounce, self._kernels.judge, self._kernels.settle = k.bounce, k.judge, k.settle
             bounces = self.bounces = k.Bounces()
-            bounces.coefficient = self._constant(value, self.real)
+            bounces.coefficient, bounces.combine = self._constant(value, self.real), self._combine(1)
             bounces.kick, bounces.before = (
                 self._array(self.model.max_contacts, self.real),
                 self._array(self.model.max_contacts, self._types.vec3),
