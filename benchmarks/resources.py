@@ -18,7 +18,7 @@ import warp as wp
 from warp_lcp.kernels import contact_problem, lcp, record, solve_batch, tree, watch
 
 import warp_lcp as wl
-from warp_lcp.methods import LCP_METHODS, METHODS
+from warp_lcp.methods import METHODS
 from warp_lcp.simulator import PRECISIONS
 
 ARCHITECTURE = 90
@@ -72,14 +72,11 @@ def kernels(precision: str) -> dict[str, wp.Kernel]:
     found |= {f"assembled_lcp[{method}]": lcp.make(real, method) for method in ("lemke", "murty", "judice_pires")}
     generators = ("lemke", "murty", "judice_pires")
     found |= {f"assembled_lcp[{method}, anitescu_potra]": lcp.make(real, method, True) for method in generators}
-    found |= {f"assembled_lcp[{method}, joints]": lcp.make(real, method, False, True) for method in generators}
     for model in scenes():
         bounces = "joints" if model.articulated else "restitution" if model.bounces else ""
         options = [{"method": m} for m in METHODS if precision == "float64" or m != "velocity_pivoting"]
         laws = [{"formulation": law} for law in ("coulomb", "hybrid")]
-        if model.articulated:
-            options = [option for option in options if option["method"] not in LCP_METHODS]
-        else:
+        if not model.articulated:
             options.append({"method": "pgs", "integrator": "midpoint"})
         for option in (*options, *laws):
             for kernel in wl.Simulator(model, precision=precision, device="cpu", **option).kernels:

@@ -15,6 +15,7 @@ from warp_lcp.model import DofKind, JointType
 from warp_lcp.usd import read_usd
 
 from .report import ROOT
+from .scenes import Scene
 
 USD = ROOT.parent / "shared" / "usd"  # robots made by others; the README there says by whom
 #: What adapters read of a Model under its own names (adapters/protocol.py, Tree).
@@ -53,7 +54,7 @@ class Robot:
         Raises:
             ValueError: where contacts differ: engines combine two materials in different ways.
         """
-        values = {float(mu) for mu in self.model.friction.ravel()}
+        values = {float(mu) for mu in self.model.friction.ravel()} or {0.0}
         if len(values) != 1:
             raise ValueError(f"{self.name}: friction coefficients {sorted(values)}; engines combine unequal ones in different ways")
         return values.pop()
@@ -91,6 +92,26 @@ class Robot:
             q=self.q,
             v=self.v,
         )
+
+
+def of_scene(scene: Scene) -> Robot:
+    """A scene that carries its own model, as other engines are told of robots.
+
+    Raises:
+        ValueError: for what adapters are not told: kinematic bodies, belts, constant forces, joints that close loops.
+    """
+    model = scene.made
+    assert model is not None
+    if model.loops:
+        raise ValueError(f"{scene.name}: adapters know no loops, and {model.loops[0].name} is one")
+    if (model.dof_kind == DofKind.PRESCRIBED).any() or model.shape_surface_velocity.any():
+        raise ValueError(f"{scene.name}: adapters know no bodies and surfaces that move by themselves")
+    if scene.wrench is not None:
+        raise ValueError(f"{scene.name}: adapters of robots know no constant forces")
+    q, v = (np.tile(x, (scene.envs, 1)) for x in (model.q0, model.v0))
+    robot = Robot(scene.name, model, scene.dt, scene.steps, q, v, scene.restitution)
+    _ = robot.friction  # one coefficient
+    return robot
 
 
 def load(path: Path) -> wl.Model:

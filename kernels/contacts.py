@@ -16,7 +16,7 @@ import warp as wp
 
 from . import rigid, tree
 from .collide import FAR_PAIR, NO_POINT, pair_functions
-from .types import CONE, DISC, FACETS, OPTIONS, OVERFLOW, REGULARIZED, scalar_types
+from .types import CONE, DISC, FACETS, MAX, MIN, MULTIPLY, OPTIONS, OVERFLOW, REGULARIZED, scalar_types
 
 # Overlaps that no load explains are pushed apart no faster than this [m/s], whatever the stiffness; what turns comes on top.
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
@@ -342,6 +342,24 @@ def row_functions(real) -> SimpleNamespace:
 
 
 @functools.cache
+def combined_by(real):
+    """Function (mode, a, b): the coefficient of two materials."""
+
+    @wp.func
+    def combined(mode: int, a: real, b: real) -> real:
+        result = real(0.5) * (a + b)
+        if mode == MIN:
+            result = wp.min(a, b)
+        elif mode == MULTIPLY:
+            result = a * b
+        elif mode == MAX:
+            result = wp.max(a, b)
+        return result
+
+    return combined
+
+
+@functools.cache
 def make(real, trees: bool = False) -> SimpleNamespace:
     """Kernels ``combine_pairs`` (dim N, P), ``select_contacts`` (dim E) and ``contact_rows`` (dim E, lanes).
 
@@ -353,18 +371,23 @@ def make(real, trees: bool = False) -> SimpleNamespace:
     f = row_functions(real)
     contact_parameters, velocities, mobility = f.contact_parameters, f.velocities, f.mobility
     expected, read_row, write_row = f.expected, f.read_row, f.write_row
+    combined = combined_by(real)
     forest = tree.functions(real)
     halve, product = forest.halve, forest.product
     Mechanics = forest.Trees if trees else Bodies
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def combine_pairs(topology: Topology, parameters: Parameters):
-        """Friction and contact parameters of every pair: the mean of its two shapes' materials, or Table 1."""
+    def combine_pairs(topology: Topology, parameters: Parameters, combine: wp.array(dtype=int)):
+        """Friction and contact parameters of every pair: of its two shapes' materials the mean, or as combine [P | 0] says, or Table 1."""
         i, pair = wp.tid()
         a = topology.pairs[pair, 0]
         b = topology.pairs[pair, 1]
         if i < parameters.pair_friction.shape[0]:
-            parameters.pair_friction[i, pair] = real(0.5) * (parameters.friction[i, a] + parameters.friction[i, b])
+            mean = real(0.5) * (parameters.friction[i, a] + parameters.friction[i, b])
+            if combine.shape[0] > 0:
+                for k in range(2):
+                    mean[k] = combined(combine[pair], parameters.friction[i, a][k], parameters.friction[i, b][k])
+            parameters.pair_friction[i, pair] = mean
         if i < parameters.pair_contact.shape[0]:
             mass = real(0.0)  # of the lighter movable body
             for side in range(2):

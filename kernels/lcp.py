@@ -6,7 +6,9 @@ h sigma_up. v and h lambda_t are eliminated: with W = J M^-1 J^T + epsilon, b = 
 
     h lambda_t = A^-1 (E (w_up - w_lo) - W_tn h lambda_n - b_t).
 
-Contacts without friction have the one unknown h lambda_n and no rows in A. Frozen limits (box and hybrid laws) are numbers in q
+Contacts without friction have the one unknown h lambda_n and no rows in A. Joints that close loops have no unknown: all three of their rows
+are bilateral (eq. 14) and are eliminated with the tangents, t above being all eliminated rows. Frozen
+limits (box and hybrid laws) are numbers in q
 instead of entries mu.
 
 Anitescu and Potra (ref. 6) have generators instead: h lambda_t = D beta with the 2 k directions +-e_j, and
@@ -24,7 +26,7 @@ import warp as wp
 
 from . import linear, problem, rigid, tree
 from .solve_batch import solver
-from .types import BLOCK_OPTIONS, ITERATION_LIMIT, scalar_types, sync
+from .types import BLOCK_OPTIONS, HELD, ITERATION_LIMIT, scalar_types, sync
 
 
 @functools.cache
@@ -42,9 +44,9 @@ def functions(real, trees: bool = False) -> SimpleNamespace:
     @wp.struct
     class ContactWorkspace:
         W: wp.array3d(dtype=real)  # [P, 3 R, 3 R] J M^-1 J^T + epsilon, order n t1 t2 within a contact
-        A_inv: wp.array3d(dtype=real)  # [P, 2 R, 2 R] inverse of W_tt, contacts with friction only
-        G: wp.array3d(dtype=real)  # [P, 2 R, R + 1] A^-1 W_tn; last column A^-1 b_t
-        friction: wp.array2d(dtype=int)  # [P, R + 1] index of the contact within A, -1 = frictionless; last: their number
+        A_inv: wp.array3d(dtype=real)  # [P, 3 R, 3 R] inverse of W_tt, of the eliminated rows (without loops [P, 2 R, 2 R])
+        G: wp.array3d(dtype=real)  # [P, 3 R, R + 1] A^-1 W_tn; last column A^-1 b_t
+        friction: wp.array2d(dtype=int)  # [P, R + 1] first row of the contact within A, -1 = none; last: how many rows there are
         start: wp.array2d(dtype=int)  # [P, R + 1] first unknown of each contact; last: number of unknowns
 
     @wp.func
@@ -68,6 +70,16 @@ def functions(real, trees: bool = False) -> SimpleNamespace:
         return e
 
     @wp.func
+    def eliminated(k: int) -> int:
+        """Rows of a contact with k directions that are eliminated: both tangents, none without friction, all three of a loop's."""
+        rows = int(2)
+        if k == 0:
+            rows = 0
+        elif k == HELD:
+            rows = 3
+        return rows
+
+    @wp.func
     def number_unknowns(ws: ContactWorkspace, contacts: Contacts, env: int, slot: int, r: int, lane: int):
         if lane == 0:
             unknowns = int(0)
@@ -76,10 +88,11 @@ def functions(real, trees: bool = False) -> SimpleNamespace:
                 k = contacts.directions[env, i]
                 ws.start[slot, i] = unknowns
                 ws.friction[slot, i] = -1
-                unknowns += 1 + 2 * k
-                if k > 0:
+                if k != HELD:
+                    unknowns += 1 + 2 * k
+                if k != 0:
                     ws.friction[slot, i] = frictional
-                    frictional += 1
+                    frictional += eliminated(k)
             ws.start[slot, r] = unknowns
             ws.friction[slot, r] = frictional
         sync()
@@ -99,23 +112,27 @@ def functions(real, trees: bool = False) -> SimpleNamespace:
             fi = ws.friction[slot, i]
             fj = ws.friction[slot, j]
             if fi >= 0 and fj >= 0:
-                for a in range(2):
-                    for b in range(2):
-                        ws.A_inv[slot, 2 * fi + a, 2 * fj + b] = block[1 + a, 1 + b]
+                # Tangents are the last two of three rows; a loop's are all three.
+                rows_i = eliminated(contacts.directions[env, i])
+                rows_j = eliminated(contacts.directions[env, j])
+                for a in range(rows_i):
+                    for b in range(rows_j):
+                        ws.A_inv[slot, fi + a, fj + b] = block[3 - rows_i + a, 3 - rows_j + b]
         sync()
         frictional = ws.friction[slot, r]
-        invert(ws.A_inv, slot, 2 * frictional, lane)
-        for row in range(lane, 2 * frictional, wp.block_dim()):
+        invert(ws.A_inv, slot, frictional, lane)
+        for row in range(lane, frictional, wp.block_dim()):
             for j in range(r + 1):
                 total = real(0.0)
                 for i in range(r):
                     fi = ws.friction[slot, i]
                     if fi >= 0:
-                        for a in range(2):
-                            right = contacts.free[env, i][1 + a]
+                        rows = eliminated(contacts.directions[env, i])
+                        for a in range(rows):
+                            right = contacts.free[env, i][3 - rows + a]
                             if j < r:
-                                right = ws.W[slot, 3 * i + 1 + a, 3 * j]
-                            total += ws.A_inv[slot, row, 2 * fi + a] * right
+                                right = ws.W[slot, 3 * i + 3 - rows + a, 3 * j]
+                            total += ws.A_inv[slot, row, fi + a] * right
                 ws.G[slot, row, j] = total
         sync()
 
@@ -136,23 +153,26 @@ def functions(real, trees: bool = False) -> SimpleNamespace:
             fj = ws.friction[slot, j]
             ki = contacts.directions[env, i]
             kj = contacts.directions[env, j]
+            if ki == HELD or kj == HELD:
+                continue
             # u_n = (W_nn - W_nt A^-1 W_tn) h lambda_n + W_nt A^-1 E (w_up - w_lo) + b_n - W_nt A^-1 b_t
             nn = ws.W[slot, 3 * i, 3 * j]
             for c in range(r):
                 fc = ws.friction[slot, c]
                 if fc >= 0:
-                    for a in range(2):
-                        nn -= ws.W[slot, 3 * i, 3 * c + 1 + a] * ws.G[slot, 2 * fc + a, j]
+                    rows = eliminated(contacts.directions[env, c])
+                    for a in range(rows):
+                        nn -= ws.W[slot, 3 * i, 3 * c + 3 - rows + a] * ws.G[slot, fc + a, j]
             lcp.M[slot, si, sj] = nn
             for m in range(kj):
                 e = direction(kj, m)
-                g = ws.G[slot, 2 * fj, i] * e[0] + ws.G[slot, 2 * fj + 1, i] * e[1]
+                g = ws.G[slot, fj, i] * e[0] + ws.G[slot, fj + 1, i] * e[1]
                 lcp.M[slot, si, sj + 1 + m] = g
                 lcp.M[slot, si, sj + 1 + kj + m] = -g
             # h sigma_lo,up = mu h lambda_n +- E^T h lambda_t + rho w_lo,up   (eqs. 29 and 30)
             for m in range(ki):
                 e = direction(ki, m)
-                g = ws.G[slot, 2 * fi, j] * e[0] + ws.G[slot, 2 * fi + 1, j] * e[1]
+                g = ws.G[slot, fi, j] * e[0] + ws.G[slot, fi + 1, j] * e[1]
                 mu = real(0.0)
                 if i == j:
                     mu = contacts.mu[env, i][wp.min(m, 1)]
@@ -163,7 +183,7 @@ def functions(real, trees: bool = False) -> SimpleNamespace:
                     k_ml = real(0.0)
                     for a in range(2):
                         for b in range(2):
-                            k_ml += e[a] * ws.A_inv[slot, 2 * fi + a, 2 * fj + b] * f[b]
+                            k_ml += e[a] * ws.A_inv[slot, fi + a, fj + b] * f[b]
                     rho = real(0.0)
                     if i == j and c == m:
                         rho = rho_scale * k_ml
@@ -175,16 +195,19 @@ def functions(real, trees: bool = False) -> SimpleNamespace:
             si = ws.start[slot, i]
             fi = ws.friction[slot, i]
             ki = contacts.directions[env, i]
+            if ki == HELD:
+                continue
             b_n = contacts.free[env, i][0]
             for c in range(r):
                 fc = ws.friction[slot, c]
                 if fc >= 0:
-                    for a in range(2):
-                        b_n -= ws.W[slot, 3 * i, 3 * c + 1 + a] * ws.G[slot, 2 * fc + a, r]
+                    rows = eliminated(contacts.directions[env, c])
+                    for a in range(rows):
+                        b_n -= ws.W[slot, 3 * i, 3 * c + 3 - rows + a] * ws.G[slot, fc + a, r]
             lcp.q[slot, si] = b_n
             for m in range(ki):
                 e = direction(ki, m)
-                g = ws.G[slot, 2 * fi, r] * e[0] + ws.G[slot, 2 * fi + 1, r] * e[1]
+                g = ws.G[slot, fi, r] * e[0] + ws.G[slot, fi + 1, r] * e[1]
                 bound = contacts.bound[env, i][wp.min(m, 1)]
                 lcp.q[slot, si + 1 + m] = bound - g
                 lcp.q[slot, si + 1 + ki + m] = bound + g
@@ -196,21 +219,25 @@ def functions(real, trees: bool = False) -> SimpleNamespace:
         """h lambda of every contact from the solution in lcp.z."""
         r = contacts.count[env]
         for i in range(lane, r, wp.block_dim()):
-            p = vec3(lcp.z[slot, ws.start[slot, i]], real(0.0), real(0.0))
+            p = vec3()
+            if contacts.directions[env, i] != HELD:
+                p[0] = lcp.z[slot, ws.start[slot, i]]
             fi = ws.friction[slot, i]
             if fi >= 0:
-                for a in range(2):
-                    total = -ws.G[slot, 2 * fi + a, r]
+                rows = eliminated(contacts.directions[env, i])
+                for a in range(rows):
+                    total = -ws.G[slot, fi + a, r]
                     for j in range(r):
-                        sj = ws.start[slot, j]
-                        total -= ws.G[slot, 2 * fi + a, j] * lcp.z[slot, sj]
-                        fj = ws.friction[slot, j]
                         kj = contacts.directions[env, j]
-                        for m in range(kj):
-                            e = direction(kj, m)
-                            w = lcp.z[slot, sj + 1 + m] - lcp.z[slot, sj + 1 + kj + m]
-                            total += (ws.A_inv[slot, 2 * fi + a, 2 * fj] * e[0] + ws.A_inv[slot, 2 * fi + a, 2 * fj + 1] * e[1]) * w
-                    p[1 + a] = total
+                        if kj != HELD:
+                            sj = ws.start[slot, j]
+                            total -= ws.G[slot, fi + a, j] * lcp.z[slot, sj]
+                            fj = ws.friction[slot, j]
+                            for m in range(kj):
+                                e = direction(kj, m)
+                                w = lcp.z[slot, sj + 1 + m] - lcp.z[slot, sj + 1 + kj + m]
+                                total += (ws.A_inv[slot, fi + a, fj] * e[0] + ws.A_inv[slot, fi + a, fj + 1] * e[1]) * w
+                    p[3 - rows + a] = total
             contacts.impulse[env, i] = p
         sync()
 
@@ -330,7 +357,9 @@ def make(real, method: str, generators: bool = False, trees: bool = False):
                     n = assemble_generators(lcp, ws, bodies, contacts, env, slot, lane)
                 else:
                     n = assemble(lcp, ws, bodies, contacts, env, slot, rho_scale, lane)
-                result = solve(lcp, slot, n, 10 * n + 100, lane)
+                result = wp.vec2i(0, 0)
+                if n > 0:
+                    result = solve(lcp, slot, n, 10 * n + 100, lane)
                 if wp.static(generators):
                     generated_impulses(lcp, ws, contacts, env, slot, lane)
                 else:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recording of a rollout: wrenches in, states out, at the step that counters on the device say.
+"""Recording of a rollout: wrenches and controls of joints in, states out, at the step that counters on the device say.
 
 What changes from one rollout to the next, the addresses of its arrays first of all, stands in a ``Tape`` on the device, so
 that the captured step reads it from there and is captured once.
@@ -15,7 +15,7 @@ from .types import OPTIONS, scalar_types
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """The struct ``Tape`` and kernels ``apply_wrench``, ``record_row`` and ``add_seen``."""
+    """The struct ``Tape`` and kernels ``apply_wrench``, ``apply_control``, ``record_row`` and ``add_seen``."""
     t = scalar_types(real)
     transform, spatial, Bodies = t.transform, t.spatial, t.Bodies
 
@@ -25,6 +25,9 @@ def make(real) -> SimpleNamespace:
 
         every: int  # steps to a row
         wrench: wp.array3d(dtype=spatial)  # [steps, 1|E, B] N, N m at the centre of mass, world axes
+        position: wp.array3d(dtype=real)  # [steps, 1|E, nv] targets of drives, m or rad
+        velocity: wp.array3d(dtype=real)  # [steps, 1|E, nv] likewise, m/s or rad/s
+        force: wp.array3d(dtype=real)  # [steps, 1|E, nv] N or N m along the joints
         q: wp.array3d(dtype=real)  # [T, E, nq]
         v: wp.array3d(dtype=real)  # [T, E, nv]
         body_pose: wp.array3d(dtype=transform)  # [T, E, B]
@@ -41,6 +44,27 @@ def make(real) -> SimpleNamespace:
         source = tape[0].wrench
         for env in range(start, wrench.shape[0], stride):
             wrench[env, b] = source[step[start, 0], env % source.shape[1], b]
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def apply_control(
+        tape: wp.array(dtype=Tape),
+        step: wp.array2d(dtype=int),
+        position: wp.array2d(dtype=real),
+        velocity: wp.array2d(dtype=real),
+        force: wp.array2d(dtype=real),
+        stride: int,
+    ):
+        """Targets and forces of this step, where there are any; launch with dim (E, nv)."""
+        start, i = wp.tid()
+        source = tape[0]
+        row = step[start, 0]
+        for env in range(start, position.shape[0], stride):
+            if source.position.shape[0] > 0:
+                position[env, i] = source.position[row, env % source.position.shape[1], i]
+            if source.velocity.shape[0] > 0:
+                velocity[env, i] = source.velocity[row, env % source.velocity.shape[1], i]
+            if source.force.shape[0] > 0:
+                force[env, i] = source.force[row, env % source.force.shape[1], i]
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def record_row(
@@ -109,4 +133,4 @@ def make(real) -> SimpleNamespace:
         status[env] = status[env] | seen_status[env]
         iterations[env] = iterations[env] + seen_iterations[env]
 
-    return SimpleNamespace(Tape=Tape, apply_wrench=apply_wrench, record_row=record_row, add_seen=add_seen)
+    return SimpleNamespace(Tape=Tape, apply_wrench=apply_wrench, apply_control=apply_control, record_row=record_row, add_seen=add_seen)

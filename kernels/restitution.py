@@ -23,6 +23,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from .contacts import combined_by
 from .types import OPTIONS, RESTITUTION_REDUCED, SLIDE, scalar_types
 
 # A contact bounces where it approaches faster than this times the speed that the step adds to its approach (|g| h at least).
@@ -45,6 +46,7 @@ APPLY = wp.constant(4)  # the theta to stay with
 def make(real) -> SimpleNamespace:
     """Bundle ``Bounces`` and kernels ``bounce`` (dim E, R), ``judge`` and ``settle`` (dim E)."""
     t = scalar_types(real)
+    combined = combined_by(real)
     vec2, vec3 = t.vec2, t.vec3
     Contacts, Parameters, Topology = t.Contacts, t.Parameters, t.Topology
 
@@ -53,6 +55,7 @@ def make(real) -> SimpleNamespace:
         """E environments, R contacts, S shapes. Points are (theta, W less what is allowed [J])."""
 
         coefficient: wp.array2d(dtype=real)  # [1|E, S] e of each shape
+        combine: wp.array(dtype=int)  # [P | 0] how a pair's two become one; none: all by their mean
         kick: wp.array2d(dtype=real)  # [E, R] what theta = 1 adds to the shift of the normal row, not positive, m/s
         before: wp.array2d(dtype=vec3)  # [E, R] u- in the contact frame, m/s
         stage: wp.array(dtype=int)  # [E]
@@ -94,6 +97,9 @@ def make(real) -> SimpleNamespace:
             pair = topology.slot_pair[contacts.slot[env, i]]
             row = env % bounces.coefficient.shape[0]
             e = real(0.5) * (bounces.coefficient[row, topology.pairs[pair, 0]] + bounces.coefficient[row, topology.pairs[pair, 1]])
+            if bounces.combine.shape[0] > 0:
+                e_a = bounces.coefficient[row, topology.pairs[pair, 0]]
+                e = combined(bounces.combine[pair], e_a, bounces.coefficient[row, topology.pairs[pair, 1]])
             free = contacts.free[env, i]
             shift = contacts.shift[env, i]
             frame = contacts.frame[env, i]

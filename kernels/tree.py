@@ -770,12 +770,17 @@ def make(real) -> SimpleNamespace:
                 r = bodies.com[env, b] - trees.origin[env, trees.root[b]]
                 gained = pair(moved_by(trees.gained[env, b], r), wp.spatial_bottom(trees.gained[env, b]))
                 bodies.free_velocity[env, b] = bodies.velocity[env, b] + gained
-            for b in range(trees.order.shape[0]):
+            for k in range(trees.order.shape[0]):
+                b = trees.order[k]
                 bodies.inv_mass[env, b] = real(0.0)
                 bodies.inv_inertia[env, b] = mat33()
                 if trees.last[b] >= 0:
-                    # What a body alone has: a scale for what is about to hit it, not its mobility.
-                    bodies.inv_mass[env, b] = real(1.0) / parameters.mass[env % parameters.mass.shape[0], b]
+                    # What a body alone has: a scale for what is about to hit it, not its mobility. Of one without mass what carries it has.
+                    m = parameters.mass[env % parameters.mass.shape[0], b]
+                    if m > real(0.0):
+                        bodies.inv_mass[env, b] = real(1.0) / m
+                    elif trees.parent[b] >= 0:
+                        bodies.inv_mass[env, b] = bodies.inv_mass[env, trees.parent[b]]
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def integrate(

@@ -51,6 +51,11 @@ ALIGNED = wp.constant(1)
 FACETS = wp.constant(2)
 CONE = wp.constant(3)  # Coulomb's: nothing to discretise
 
+# How the coefficients of two materials become one (warp_lcp.Combine): the mean, or...
+MIN = wp.constant(1)
+MULTIPLY = wp.constant(2)
+MAX = wp.constant(3)
+
 
 @functools.cache
 def scalar_types(real) -> SimpleNamespace:

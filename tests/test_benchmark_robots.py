@@ -4,6 +4,7 @@
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from test_joints import moved, pendulum, poses, quadruped, random_state, random_
 
 import warp_lcp as wl
 from benchmarks import dynamics, peers, regression, robot_speed, robots
+from benchmarks.cases import CASES
 from benchmarks.peers.session import session
 from warp_lcp.model import DofKind, Drive, JointType
 
@@ -94,8 +96,6 @@ def test_what_mjcf_cannot_say_is_refused(tmp_path):
     assert 'range="0.499999999 0.500000001"' in mjcf.model(job(robot(made(limit=(0.5, 0.5))), tmp_path))
     # All shapes of two bodies touch or none: the thigh of a leg passes through nothing but its own shank.
     model = quadruped().finalize()
-    with pytest.raises(protocol.Refused, match="limited force"):
-        mjcf.model(job(robot(model), tmp_path))
     text = mjcf.model(job(robot(replace(model, drive=np.zeros_like(model.drive))), tmp_path))
     assert '<exclude body1="b2" body2="b3"/>' in text or '<exclude body1="b3" body2="b2"/>' in text
     two = wl.ModelBuilder()
@@ -106,6 +106,32 @@ def test_what_mjcf_cannot_say_is_refused(tmp_path):
     two.filter_pair(0, 2)
     with pytest.raises(protocol.Refused, match="not with others"):
         mjcf.model(job(robot(two.finalize()), tmp_path))
+
+
+def test_drives_of_limited_force_are_actuators(tmp_path):
+    """Force a + b q + c dq/dt, limited, of no control: 6 (0.2 - q) + 0.5 (0.3 - dq/dt) within 4 N m."""
+    builder = wl.ModelBuilder()
+    body = builder.add_body(mass=1.0, inertia=0.01 * np.eye(3))
+    builder.add_joint(JointType.REVOLUTE, -1, body, drive=Drive(6.0, 0.5, 4.0, target=0.2, target_velocity=0.3), damping=0.1)
+    text = mjcf.model(job(robot(builder.finalize()), tmp_path))
+    actuator = ElementTree.fromstring(text).find("actuator/general")
+    assert [float(x) for x in actuator.get("biasprm").split()] == pytest.approx([1.35, -6.0, -0.5])
+    assert actuator.get("forcerange") == "-4.0 4.0"
+    assert actuator.get("gainprm") == "0"
+    joint = ElementTree.fromstring(text).find(f".//joint[@name='{actuator.get('joint')}']")
+    assert (joint.get("stiffness"), joint.get("damping")) == ("0.0", "0.1")
+    assert ElementTree.fromstring(text).find("option").get("integrator") == "implicitfast"
+
+
+def test_scenes_with_joints_are_robots_to_others():
+    """Where they have nothing that adapters are not told: joints that close loops, belts, constant forces."""
+    chain = CASES["chain"].scene(1e-3, 2)
+    told = robots.of_scene(chain)
+    assert told.q.shape == (2, chain.made.nq)
+    assert np.abs(told.pose - chain.pose).max() < 1e-12
+    for name, why in (("fourbar", "loops"), ("stick_slip", "move by themselves"), ("wedge_jams", "constant forces")):
+        with pytest.raises(ValueError, match=why):
+            robots.of_scene(CASES[name].scene(1e-3, 1))
 
 
 def test_loops_and_unequal_friction_are_no_jobs(tmp_path):

@@ -24,7 +24,12 @@ pytest.importorskip("pxr", reason="needs the extra 'usd'")
 
 ROOT = Path(__file__).resolve().parents[1]
 OPENUSD = ROOT.parent / "shared" / "usd" / "openusd"
-CONE = 'def Cone "Cone" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {}'
+EGG = """def Sphere "Egg" (prepend apiSchemas = ["PhysicsCollisionAPI"])
+{
+    double3 xformOp:scale = (1, 1, 2)
+    uniform token[] xformOpOrder = ["xformOp:scale"]
+}
+"""
 PHYSICS = 'def PhysicsScene "Scene" {}\n'
 BOX = """def Cube "Box" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsCollisionAPI", "PhysicsMassAPI"])
 {
@@ -162,25 +167,64 @@ def test_info_lists_scenes_made_elsewhere(capsys, scene, bodies):
 
 
 def test_info_lists_what_cannot_be_simulated(capsys, tmp_path):
-    scene = tmp_path / "cone.usda"
+    scene = tmp_path / "egg.usda"
     hinge = 'def PhysicsRevoluteJoint "Hinge" {\nrel physics:body0 = </Box>\n}\n'
-    scene.write_text(HEADER + PHYSICS + BOX % 2 + hinge + CONE)
+    scene.write_text(HEADER + PHYSICS + BOX % 2 + hinge + EGG)
     facts = info(capsys, scene)
-    assert (facts["simulable"], facts["dofs"], facts["pairs"], facts["joints"]) == (False, None, None, ["/Hinge"])
+    assert (facts["simulable"], facts["dofs"], facts["pairs"], facts["joints"]) == (False, None, None, [{"name": "/Hinge", "type": None}])
     assert facts["bodies"][0]["name"] == "/Box"
-    assert facts["unsupported"][0]["path"] == "/Cone"
+    assert facts["unsupported"][0]["path"] == "/Egg"
     assert main(["info", str(scene)]) == 0
     text = capsys.readouterr().out
     assert "cannot be simulated" in text
-    assert "/Cone" in text
+    assert "/Egg" in text
 
 
 def test_info_lists_joints(capsys, tmp_path):
     scene = tmp_path / "joint.usda"
     scene.write_text(HEADER + PHYSICS + BOX % 2 + 'def PhysicsRevoluteJoint "Hinge" {\nrel physics:body0 = </Box>\n}')
     facts = info(capsys, scene)
-    assert (facts["simulable"], facts["dofs"], facts["joints"]) == (True, 1, ["/Hinge"])
+    assert facts["joints"][0]["axes"][0].pop("axis") == pytest.approx([-1, 0, 0], abs=1e-15)  # the world is its second body
+    axis = {"name": "/Hinge", "kind": "angle", "limit": None, "start": 0.0, "drive": None}
+    ends = {"from": None, "to": "/Box", "loop": False, "held": None, "distance": None}
+    hinge = {"name": "/Hinge", "type": "revolute", **ends, "axes": [axis | {"armature": 0.0, "damping": 0.0, "friction": 0.0}]}
+    assert (facts["simulable"], facts["dofs"], facts["joints"]) == (True, 1, [hinge])
     assert (facts["bodies"][0]["joint"], facts["bodies"][0]["dofs"]) == ("revolute", 1)
+
+
+def test_info_of_what_acts_along_joints(capsys, tmp_path):
+    """A drive of limited force, friction, damping, a limit on one side, a loop and a distance: in JSON, in the table, as rows."""
+    box = BOX % 2
+    bodies = "".join(box.replace('"Box"', f'"{name}"') for name in "ABC")
+    ends = "rel physics:body0 = <%s>\nrel physics:body1 = <%s>\n"
+    drive = "float drive:angular:physics:stiffness = 2\nfloat drive:angular:physics:maxForce = 5\n"
+    drive += "float drive:angular:physics:targetPosition = 90\nfloat newton:friction = 0.25\nfloat newton:damping = 0.1\n"
+    scene = tmp_path / "joints.usda"
+    scene.write_text(
+        HEADER
+        + PHYSICS
+        + bodies
+        + f'def PhysicsRevoluteJoint "AB" (prepend apiSchemas = ["PhysicsDriveAPI:angular"]) {{\n{ends % ("/A", "/B")}{drive}}}\n'
+        + f'def PhysicsPrismaticJoint "x:y" {{\n{ends % ("/B", "/C")}float physics:upperLimit = 0.5\n}}\n'.replace("x:y", "BC")
+        + f'def PhysicsSphericalJoint "CA" {{\n{ends % ("/C", "/A")}bool physics:excludeFromArticulation = 1\n}}\n'
+        + f'def PhysicsDistanceJoint "D" {{\n{ends % ("/A", "/C")}float physics:maxDistance = 3\n}}\n'
+    )
+    facts = info(capsys, scene)
+    first, second, third, fourth = facts["joints"]
+    (axis,) = first["axes"]
+    assert axis["drive"]["stiffness"] == pytest.approx(2 * 180 / np.pi)
+    assert (axis["drive"]["max_force"], axis["drive"]["target"]) == (5.0, pytest.approx(np.pi / 2))
+    assert (axis["friction"], axis["damping"]) == (0.25, pytest.approx(0.1 * 180 / np.pi))
+    assert (second["type"], second["axes"][0]["limit"]) == ("prismatic", [None, 0.5])
+    assert (third["type"], third["held"], third["loop"]) == ("loop", ["tx", "ty", "tz"], True)
+    assert (fourth["type"], fourth["distance"]) == ("distance", [0.0, 3.0])
+    assert facts["joint_row_kinds"] == {"limits": 1, "drives": 1, "friction": 1, "loops": 3, "distances": 1}
+    assert main(["info", str(scene)]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "k 114.6, b 0 to 1.571 rad, at most 5 N m" in text
+    assert ".. 0.5 m" in text
+    assert "holds tx ty tz" in text
+    assert "4 of joints: 1 limits, 1 drives, 1 friction, 3 loops, 1 distances" in text
 
 
 @pytest.mark.parametrize("formulation", FORMULATIONS)
@@ -320,8 +364,8 @@ def test_scenes_that_run_refuses(capsys, tmp_path):
     scene = tmp_path / "scene.usda"
     scene.write_text(HEADER + PHYSICS + BOX.replace(', "PhysicsCollisionAPI"', "") % 0)
     assert "/Box" in error_line(capsys, "run", scene)  # without mass
-    scene.write_text(HEADER + PHYSICS + BOX % 1 + CONE)
-    assert "/Cone" in error_line(capsys, "run", scene)
+    scene.write_text(HEADER + PHYSICS + BOX % 1 + EGG)
+    assert "/Egg" in error_line(capsys, "run", scene)
     assert "no shipped scene of this name" in error_line(capsys, "run", "box_on_grund")
     assert "did you mean" in error_line(capsys, "info", "box_on_grund")
 

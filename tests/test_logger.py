@@ -268,6 +268,28 @@ def test_capsules_are_drawn_about_their_middle(tmp_path):
     assert logger.layout.size == pytest.approx(1.0)
 
 
+def test_cylinders_cones_hulls_and_meshes_are_drawn(tmp_path):
+    """A cylinder by its radius and length; others as triangles whose volume is theirs, turned outwards, a mesh as it is."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    builder = wl.ModelBuilder()
+    builder.add_mesh(-1, [(-2, -2, -1), (2, -2, -1), (2, 2, -1), (-2, 2, -1)], [(0, 1, 2), (0, 2, 3)], name="field")
+    builder.add_cylinder(builder.add_body("roll"), 0.2, 0.3, name="roll")
+    builder.add_cone(builder.add_body("hat", pose=(2, 0, 0, 0, 0, 0, 1)), 0.2, 0.3, name="hat")
+    builder.add_hull(builder.add_body("rock", pose=(4, 0, 0, 0, 0, 0, 1)), corners, name="rock")
+    path = tmp_path / "run.rrd"
+    simulate(path, builder.finalize(), frames=1, every=1)
+    assert read(path, "/world/bodies/roll", "Cylinders3D:radii")[0][1] == pytest.approx([0.2])
+    assert read(path, "/world/bodies/roll", "Cylinders3D:lengths")[0][1] == pytest.approx([0.6])
+    for entity, volume in (("/world/bodies/hat", np.pi * 0.04 * 0.6 / 3), ("/world/bodies/rock", 1.0), ("/world/static/field", 0.0)):
+        points = read(path, entity, "Mesh3D:vertex_positions")[0][1].astype(float)
+        triangles = read(path, entity, "Mesh3D:triangle_indices")[0][1]
+        normals = read(path, entity, "Mesh3D:vertex_normals")[0][1]
+        a, b, c = (points[triangles[:, k]] for k in range(3))
+        assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(volume, rel=0.01, abs=1e-6)
+        n = np.cross(b - a, c - a)
+        assert (np.einsum("ij,ij->i", n, normals[triangles[:, 0]]) > 0.99 * np.linalg.norm(n, axis=1)).all()
+
+
 def test_killed_process_leaves_its_frames(tmp_path):
     script = tmp_path / "run.py"
     script.write_text(

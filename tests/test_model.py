@@ -122,7 +122,8 @@ def test_a_model_cannot_be_changed():
 @pytest.mark.parametrize(
     ("author", "message"),
     [
-        (lambda b: b.add_body("a", mass=0.0), "a: mass is 0.0 kg; it must be finite and greater than zero"),
+        (lambda b: (b.add_body("a", mass=0.0), b.finalize()), "a: mass is 0 kg; only what hangs on a joint"),
+        (lambda b: b.add_body("a", mass=-1.0), "a: mass is -1.0 kg; it must be finite and greater than zero"),
         (lambda b: b.add_body("a", velocity=(np.nan, 0, 0)), "a: velocity is .* every number must be finite"),
         (lambda b: b.add_body("a", pose=(0, 0, 0, 0, 0, 0, 2)), "a: the quaternion .* has length 2; give a unit quaternion"),
         (lambda b: b.add_body("a", pose=(0, 0, 0)), r"a: pose has shape \(3,\); give 7 numbers"),

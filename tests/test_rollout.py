@@ -235,3 +235,68 @@ def test_arguments_are_checked(arguments, message):
     with pytest.raises(wl.WarpLcpError, match=f"rollout: .*{message}"):
         sim.rollout(**{"steps": 3, **arguments})
     assert sim.time == 0.0
+
+
+def arm() -> wl.ModelBuilder:
+    """Two links with a drive each, over a plane that the second reaches."""
+    b = wl.ModelBuilder()
+    b.add_plane(pose=(0, 0, -0.8, 0, 0, 0, 1))
+    first, second = (b.add_body(pose=(x, 0, 0, 0, 0, 0, 1), mass=1.0, inertia=0.1 * np.eye(3)) for x in (0.5, 1.5))
+    b.add_sphere(second, 0.2)
+    turn = (0, 0, np.sqrt(0.5), np.sqrt(0.5))  # x of the joint along y
+    for parent, child, at in ((-1, first, 0.0), (first, second, 0.5)):
+        frames = {"parent_frame": (at, 0, 0, *turn), "child_frame": (-0.5, 0, 0, *turn)}
+        b.add_joint(wl.JointType.REVOLUTE, parent, child, **frames, drive=wl.Drive(20.0, 2.0))
+    return b
+
+
+@pytest.mark.parametrize("names", [("position",), ("velocity", "force"), ("position", "velocity", "force")])
+@pytest.mark.parametrize("pushed", [False, True])
+def test_controls_of_every_step(names, pushed):
+    """The same bits as writing them between steps; what is not given stays, and the last ones do."""
+    rng, steps, envs = np.random.default_rng(3), 120, 3
+    stepped, rolled = simulator(arm(), envs), simulator(arm(), envs)
+    for sim in (stepped, rolled):
+        sim.control.force.assign(np.full((envs, 2), 0.25))
+    control = {name: rng.normal(size=(steps, envs, 2)) for name in names}
+    wrench = rng.normal(size=(steps, envs, 2, 6)) if pushed else None
+    expected = []
+    for i in range(steps):
+        for name in names:
+            getattr(stepped.control, name).assign(control[name][i])
+        if wrench is not None:
+            stepped.wrench.assign(wrench[i])
+        stepped.step()
+        expected.append(stepped.q.numpy().copy())
+    result = rolled.rollout(steps, wrench, ("q",), control=control)
+    assert same_bits(result.q.numpy(), np.array(expected))
+    for name in ("position", "velocity", "force"):
+        assert (getattr(rolled.control, name).numpy() == getattr(stepped.control, name).numpy()).all()
+
+
+def test_controls_on_the_device_and_for_all_environments_alike():
+    steps, target = 50, np.random.default_rng(4).normal(size=(50, 1, 2))
+    ends = []
+    for value in (target, np.repeat(target, 2, axis=1), wp.array(target, dtype=wp.float64, device=DEVICE)):
+        ends.append(simulator(arm(), 2).rollout(steps, record="q", control={"position": value}).q.numpy())
+    assert same_bits(ends[0], ends[1])
+    assert same_bits(ends[0], ends[2])
+
+
+@pytest.mark.parametrize(
+    ("control", "message"),
+    [
+        ({"torque": np.zeros((2, 1, 2))}, "give a dict with some of position, velocity, force"),
+        ({"force": np.zeros((2, 2))}, r"force has shape \(2, 2\); give \(2, 3, 2\) or \(2, 1, 2\)"),
+        ({"force": "much"}, "no array of numbers"),
+        ("force", "give a dict"),
+    ],
+)
+def test_controls_that_are_none(control, message):
+    with pytest.raises(wl.WarpLcpError, match=message):
+        simulator(arm(), 3).rollout(2, control=control)
+
+
+def test_controls_need_joints():
+    with pytest.raises(wl.WarpLcpError, match="the model has none"):
+        simulator(paper_box()).rollout(2, control={"force": np.zeros((2, 1, 6))})

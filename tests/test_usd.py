@@ -745,3 +745,78 @@ def test_launch_fan_pile_and_plates():
     pile = wl.load_usd("pile")
     moving = pile.shape_type[pile.shape_body >= 0]
     assert [np.count_nonzero(moving == kind) for kind in (ShapeType.BOX, ShapeType.SPHERE, ShapeType.CAPSULE)] == [4, 4, 4]
+
+
+# -- how coefficients of two materials become one ----------------------------------------------------------------------
+
+
+def two_materials(mode_a, mode_b, which="friction", values=(0.8, 0.3)):
+    """A box on the ground, of materials with mu = e = 0.8 and 0.3."""
+    prims = []
+    for name, mode, value in (("M", mode_a, values[0]), ("N", mode_b, values[1])):
+        content = f"float physics:staticFriction = {value}; float physics:dynamicFriction = {value}; float physics:restitution = {value};"
+        if mode:
+            content += f'uniform token physxMaterial:{which}CombineMode = "{mode}";'
+        prims.append(material(content, name))
+    ground = prim("Plane", "Ground", (COLLIDER, "MaterialBindingAPI"), 'token axis = "Z"; rel material:binding:physics = </N>;')
+    return [*prims, ground, body(content=xform(translate="(0, 0, 0.5)"), inner=bound_cube())]
+
+
+@pytest.mark.parametrize(
+    ("mode_a", "mode_b", "mu"),
+    [
+        ("", "", 0.55),
+        ("average", "average", 0.55),
+        ("min", "average", 0.3),
+        ("average", "multiply", 0.24),
+        ("multiply", "min", 0.24),
+        ("max", "multiply", 0.8),
+        ("min", "max", 0.8),
+    ],
+)
+def test_combine_modes(mode_a, mode_b, mu):
+    """The later of average, min, multiply, max rules. A box that slides at 2 m/s loses mu g t, one that falls bounces with e."""
+    sim = wl.Simulator(load(*two_materials(mode_a, mode_b)), device="cpu")
+    sim.v.assign(np.array([[2.0, 0, 0, 0, 0, 0]]))
+    sim.step(100)
+    assert sim.v.numpy()[0, 0] == pytest.approx(2 - mu * 9.81 * 0.1, rel=1e-4)
+    model = load(*two_materials(mode_a, mode_b, "restitution"))
+    sim = wl.Simulator(model, device="cpu")
+    q, v = model.q0.copy(), np.zeros(6)
+    q[2], v[2] = 0.5001, -1.0
+    sim.q.assign(q[None])
+    sim.v.assign(v[None])
+    sim.step(1)
+    assert sim.v.numpy()[0, 2] == pytest.approx(mu, rel=1e-4)
+
+
+def test_combine_mode_that_is_none():
+    ignored = read(*two_materials("median", "")).report.ignored
+    assert [(i.path, i.what) for i in ignored] == [("/M", "physxMaterial:frictionCombineMode")]
+    with pytest.raises(wl.ModelError, match=r"friction_combine is 7; give one of Combine\.AVERAGE"):
+        wl.ModelBuilder().add_plane(material=wl.Material(friction_combine=7))
+
+
+# -- articulations that pass through themselves -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "pairs"),
+    [
+        ("", 4),
+        ("bool physxArticulation:enabledSelfCollisions = 0;", 3),
+        ("bool newton:selfCollisionEnabled = 0;", 3),
+        ("bool newton:selfCollisionEnabled = 1; bool physxArticulation:enabledSelfCollisions = 0;", 4),
+    ],
+)
+def test_self_collision_of_an_articulation(content, pairs):
+    """A - B - C in a row, A and C may touch unless the articulation says otherwise; all three touch what stands beside them."""
+    bodies = [body(n, xform(translate=f"({2 * i}, 0, 0)")) for i, n in enumerate("ABC")]
+    ends = [f"rel physics:body0 = </R/{a}>; rel physics:body1 = </R/{b}>;" for a, b in ("AB", "BC")]
+    frames = "point3f physics:localPos0 = (1, 0, 0); point3f physics:localPos1 = (-1, 0, 0);"
+    joints = [prim("PhysicsRevoluteJoint", f"J{i}", (), e + frames) for i, e in enumerate(ends)]
+    root = prim("Xform", "R", ("PhysicsArticulationRootAPI",), content + "".join([*bodies, *joints]))
+    reading = read(root, cube("Ground"))
+    model = reading.builder.finalize()
+    assert len(model.pairs) == pairs
+    assert not reading.report.ignored

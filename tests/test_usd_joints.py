@@ -5,10 +5,12 @@ import math
 
 import numpy as np
 import pytest
-from test_usd import BODY, CM, JOINT, MASS, body, cube, layer, load, needs_shared, prim, read, refused, xform  # noqa: F401
+from test_usd import BODY, CM, JOINT, MASS, SCENE, SI, body, cube, layer, load, needs_shared, prim, read, refused, stage, xform  # noqa: F401
 
 import warp_lcp as wl
 from warp_lcp import JointType
+from warp_lcp.joints import compose, inverse, rotate
+from warp_lcp.usd import read_usd
 
 pytest.importorskip("pxr", reason="needs the extra 'usd'")
 
@@ -121,8 +123,6 @@ def test_what_is_not_simulated_is_named():
     assert [(i.path, i.why) for i in breaks.report.ignored] == [("/J", "joints do not break here")]
     cone = read(*pair("Spherical", "float physics:coneAngle0Limit = 30; float physics:coneAngle1Limit = 30;"))
     assert [i.path for i in cone.report.ignored] == ["/J"]
-    drive = 'uniform token drive:angular:physics:type = "acceleration"; float drive:angular:physics:stiffness = 3;'
-    assert "type acceleration is not supported" in refused(*pair("Revolute", drive, ("PhysicsDriveAPI:angular",)))
 
 
 def test_attributes_of_other_engines():
@@ -184,3 +184,372 @@ def test_numbers_are_the_decimals_that_were_written():
     assert model.joint_child_pose[1, :3].tolist() == [-0.1, 0.7, 0]
     assert model.limit[6].tolist() == [-0.7, 0.3]
     assert model.drive[6, [0, 2]].tolist() == [0.9, 0.6]
+
+
+# -- joints whose mobilities add ------------------------------------------------------------------------------------
+
+
+def root(*prims, adds=1, more=""):
+    """An articulation in which mobilities of joints between the same two bodies add."""
+    content = f"uniform bool newton:jointsAddMobility = {adds};{more}"
+    return prim("Xform", "Root", ("PhysicsArticulationRootAPI",), content + "".join(prims))
+
+
+ENDS = "rel physics:body0 = </Root/A>; rel physics:body1 = </Root/B>;"
+
+
+def stacked(*members, adds=1, at="(1, 0, 0)"):
+    """Two bodies, B one unit beside A, and joints (kind, name, axis, localPos0 on A, more) between them."""
+    bodies = [body("A", LIGHT, inner=""), body("B", LIGHT + xform(translate=at), inner="")]
+    joints = []
+    for kind, name, axis, place, more in members:
+        on_b = tuple(np.subtract(place, eval(at)).tolist())
+        frames = f"point3f physics:localPos0 = {place}; point3f physics:localPos1 = {on_b};"
+        along = f'uniform token physics:axis = "{axis}";' if kind != "Spherical" else ""
+        joints.append(joint(kind, ENDS + along + frames + more, (), name))
+    return [root(*bodies, *joints, adds=adds)]
+
+
+def relative(model, q):
+    """Pose of the second body in the first: of the last body, in a model whose first body is free."""
+    sim = wl.Simulator(model, device="cpu")
+    sim.q.assign(np.r_[model.q0[:7], q][None])
+    pose = sim.body_pose.numpy()[0]
+    return compose(inverse(pose[0]), pose[model.body_names.index("/Root/B")])
+
+
+def expected(motions, at=(1, 0, 0)):
+    """E_1 E_2 ... on where B stands at zero: each a way along an axis, or an angle about one through a point, as written in A."""
+    pose = np.array([0, 0, 0, 0, 0, 0, 1.0])
+    for kind, axis, point, value in motions:
+        direction = np.eye(3)["XYZ".index(axis)]
+        turn = np.r_[np.sin(value / 2) * direction, np.cos(value / 2)] if kind == "Revolute" else np.r_[0, 0, 0, 1.0]
+        way = value * direction if kind == "Prismatic" else np.array(point) - rotate(turn, np.array(point, dtype=float))
+        pose = compose(pose, np.r_[way, turn])
+    return compose(pose, np.array([*at, 0, 0, 0, 1.0]))
+
+
+STACKS = {
+    "universal": [("Revolute", "h1", "Y", (0.5, 0, 0), ""), ("Revolute", "h2", "X", (0.5, 0, 0), "")],
+    "left-handed": [("Revolute", name, name, (0.5, 0, 0), "") for name in "ZYX"],
+    "planar": [("Prismatic", "s1", "X", (0, 0, 0), ""), ("Prismatic", "s2", "Z", (1, 0, 0), ""), ("Revolute", "h", "Y", (0.2, 3, 0), "")],
+    "slide carried by a hinge": [("Revolute", "h", "Z", (0.2, 0, 0), ""), ("Prismatic", "s", "X", (0, 0, 0), "")],
+    "lines that meet elsewhere": [("Revolute", "h1", "Z", (0.5, 0, 3), ""), ("Revolute", "h2", "X", (4, 0, 0.25), "")],
+    "parallel hinges": [("Revolute", "h1", "Z", (0.25, 0, 0), ""), ("Revolute", "h2", "Z", (0.75, 0, 0), "")],
+    "skew hinges": [("Revolute", "h1", "Z", (0.25, 0, 0), ""), ("Revolute", "h2", "Y", (0.75, 0.1, 0), "")],
+}
+
+
+@pytest.mark.parametrize("case", STACKS)
+def test_mobilities_add_in_stage_order(case):
+    """Where the second body stands, at any coordinates; only axes of rotation that do not meet take a body between."""
+    members = STACKS[case]
+    model = load(*stacked(*members))
+    values = np.array([0.4, -0.3, 0.7])[: len(members)]
+    assert (model.dofs, len(model.loops)) == (6 + len(members), 0)
+    assert model.num_bodies == (3 if case in ("parallel hinges", "skew hinges") else 2)
+    motions = [(kind, axis, place, value) for (kind, _, axis, place, _), value in zip(members, values, strict=True)]
+    assert expected(motions) == pytest.approx(relative(model, values), abs=1e-9)
+    sim = wl.Simulator(model, device="cpu")
+    sim.step(10)
+    assert not sim.status.numpy().any()
+    assert "act one after the other" in " ".join(model.report.notes)
+
+
+def test_stack_of_slides_and_a_ball():
+    members = [("Prismatic", "s1", "X", (0, 0, 0), ""), ("Prismatic", "s2", "Y", (0, 0, 0), ""), ("Spherical", "b", "", (0.5, 0, 0), "")]
+    model = load(*stacked(*members))
+    assert model.joint_type.tolist().count(JointType.SPHERICAL) == 1
+    turn = np.array([0.1, 0.2, -0.3, math.sqrt(1 - 0.14)])
+    pose = relative(model, [0.4, -0.3, *turn])
+    assert pose == pytest.approx(np.r_[np.array([0.9, -0.3, 0]) + rotate(turn, np.array([0.5, 0, 0])), turn], abs=1e-9)
+
+
+def test_without_the_attribute_joints_between_the_same_bodies_hold_together():
+    model = load(*stacked(*STACKS["universal"], adds=0))
+    assert (model.dofs, [loop.name for loop in model.loops]) == (7, ["/Root/h2"])
+
+
+def test_limits_drives_and_states_of_a_stack_stay_with_their_axes():
+    more = "float physics:lowerLimit = -30; float physics:upperLimit = 60; float state:angular:physics:position = 45;"
+    more += "float newton:armature = 0.5;"
+    model = load(*stacked(("Revolute", "h1", "Z", (0, 0, 0), more), ("Revolute", "h2", "Y", (0, 0, 0), "float newton:damping = 2;")))
+    assert model.limit[6] == pytest.approx(np.radians([-30, 60]))
+    assert np.isinf(model.limit[7]).all()
+    assert model.armature[6:] == pytest.approx([0.5, 0])
+    assert model.damping[6:] == pytest.approx([0, 2 * 180 / math.pi])
+    assert model.q0[7:] == pytest.approx([math.pi / 4, 0], abs=1e-12)
+
+
+def test_stacks_that_are_none():
+    same = [("Revolute", "h1", "Z", (0, 0, 0), ""), ("Revolute", "h2", "Z", (0, 0, 0), "")]
+    assert "/Root/h1, /Root/h2 add mobilities that are not independent" in refused(*stacked(*same))
+    heavy = [(*m[:4], "float newton:armature = 1;") for m in same]
+    assert load(*stacked(*heavy)).dofs == 8
+    away = "point3f physics:localPos1 = (7, 0, 0);"
+    apart = [STACKS["universal"][0], joint("Revolute", ENDS + away, (), "h2")]
+    stage = stacked(apart[0])[0].rstrip().removesuffix("}") + apart[1] + "}"
+    assert "/Root/h1: it and /Root/h2 add their mobilities, but disagree about where /Root/B stands" in refused(stage)
+
+
+def test_dynamics_of_hinges_that_do_not_meet():
+    """Two parallel hinges with a body without mass between them are a double pendulum with a rod of no mass.
+
+    M = J^T diag(m, m, I) J of the end: at q = 0, B's centre 0.75 and 0.25 from the hinges.
+    """
+    model = load(*stacked(*STACKS["parallel hinges"]))
+    mass = wl.Simulator(model, device="cpu").mass_matrix().numpy()[0, 6:, 6:]
+    j = np.array([[0.75, 0.25], [1, 1]])  # velocity along y and angular velocity about z
+    assert mass == pytest.approx(j.T @ np.diag([2.0, 1.0]) @ j)
+
+
+@needs_shared
+def test_stacked_joints_of_the_converter(shared):
+    """MuJoCo's model has a free root with a universal joint, and one with a hinge."""
+    model = wl.load_usd(shared / "usd/converted/muc_stacked_joints/stacked_joints.usdc")
+    assert (model.num_bodies, model.dofs, len(model.loops)) == (4, 15, 0)
+    assert np.degrees(model.limit[6:8]) == pytest.approx(np.array([[-45, 45], [-30, 30]]))
+    axes = [rotate(model.joint_pose[1, 3:], model.dof_axis[i]) for i in (6, 7)]
+    assert np.array(axes) == pytest.approx(np.eye(3)[:2], abs=1e-12)
+
+
+# -- drives of type acceleration, states at the start ----------------------------------------------------------------
+
+WEIGHTLESS = prim("PhysicsScene", "Scene", (), "float physics:gravityMagnitude = 0;")
+
+
+def accelerated(mass, kind="Revolute", world=True, head=SI, more=""):
+    """k = 0.2 and b = 0.05 by degree (revolute), k = 4 and b = 3 (prismatic), target 40 degrees or 40 units."""
+    inst, k, b = ("angular", 0.2, 0.05) if kind == "Revolute" else ("linear", 4, 3)
+    drive = f'uniform token drive:{inst}:physics:type = "acceleration"; float drive:{inst}:physics:stiffness = {k};'
+    drive += f"float drive:{inst}:physics:damping = {b}; float drive:{inst}:physics:targetPosition = 40; {more}"
+    inertia = f"float physics:mass = {mass}; float3 physics:diagonalInertia = ({mass}, {2 * mass}, {2 * mass});"
+    bodies = [body(n, inertia + xform(translate="(0, 0, 3)"), inner="") for n in ("A", "B")[: 1 if world else 2]]
+    place = "point3f physics:localPos0 = (0, 0, 3);" if world else ""
+    ends = "rel physics:body1 = </A>;" if world else JOINT
+    return wl.load_usd(stage(WEIGHTLESS, *bodies, joint(kind, ends + place + drive, (f"PhysicsDriveAPI:{inst}",)), head=head))
+
+
+@pytest.mark.parametrize("world", [True, False])
+@pytest.mark.parametrize(("kind", "head"), [("Revolute", SI), ("Prismatic", SI), ("Revolute", CM), ("Prismatic", CM)])
+def test_drive_of_type_acceleration(kind, head, world):
+    """q'' = k (q* - q) - b q', whatever the masses and units of length; from rest after 0.5 s."""
+    angular, step = kind == "Revolute", 1e-4
+    k, b, goal = (0.2 * 180 / math.pi, 0.05 * 180 / math.pi, math.radians(40)) if angular else (4, 3, 40 * (0.01 if head == CM else 1))
+    w = np.emath.sqrt(k - b * b / 4)  # imaginary where it creeps
+    t = 0.5
+    exact = goal * (1 - np.exp(-b * t / 2) * (np.cos(w * t) + b / (2 * w) * np.sin(w * t))).real
+    for mass in (0.5, 300):
+        model = accelerated(mass, kind, world, head)
+        sim = wl.Simulator(model, dt=step, device="cpu")
+        sim.step(round(t / step))
+        assert sim.q.numpy()[0, -1] == pytest.approx(exact, rel=1e-3)
+    assert model.report.notes[-1].startswith("/J: gains of drives of type acceleration are multiplied by the inertia")
+
+
+def test_acceleration_drive_of_a_chain_has_the_inertia_of_all_it_moves():
+    """1 / (M^-1)_ii of the simulator's own M, where links are free to give way; the greatest force stays a force."""
+    frames = "point3f physics:localPos0 = (0.5, 0, 0); point3f physics:localPos1 = (-0.5, 0, 0);"
+    drive = 'uniform token drive:angular:physics:type = "acceleration"; float drive:angular:physics:stiffness = 1;'
+    drive += 'float drive:angular:physics:maxForce = 7; uniform token physics:axis = "Z"; float newton:armature = 0.3;'
+    names = ("A", "B", "C")
+    bodies = [body(n, LIGHT + xform(translate=f"({i}, 0, 0)", rotateXYZ="(0, 0, 0)"), inner="") for i, n in enumerate(names)]
+    joints = []
+    for a, b in ("AB", "BC"):
+        ends = f"rel physics:body0 = </{a}>; rel physics:body1 = </{b}>;"
+        joints.append(joint("Revolute", ends + frames + drive, ("PhysicsDriveAPI:angular",), f"J{b}"))
+    model = load(*bodies, *joints)
+    mass = wl.Simulator(model, device="cpu").mass_matrix().numpy()[0]
+    seen = 1 / np.diag(np.linalg.inv(mass))[6:]
+    assert model.drive[6:, 0] == pytest.approx(seen * 180 / math.pi, rel=1e-9)
+    assert model.drive[6:, 2].tolist() == [7, 7]
+    assert (seen < np.diag(mass)[6:]).all()
+
+
+def test_joint_states_place_and_move_what_they_carry():
+    """The first hinge at 90 degrees and 30 degrees/s, the second where the bodies stand: the arm of two turns as one."""
+    state = 'uniform token physics:axis = "Z"; float state:angular:physics:position = 90; float state:angular:physics:velocity = 30;'
+    second = "rel physics:body0 = </A>; rel physics:body1 = </B>; point3f physics:localPos0 = (0.5, 0, 0);"
+    bodies = [body(n, LIGHT + xform(translate=f"({x}, 0, 0)"), inner="") for n, x in (("A", 0.5), ("B", 1.5))]
+    first = "rel physics:body1 = </A>; point3f physics:localPos1 = (-0.5, 0, 0);" + state
+    more = 'point3f physics:localPos1 = (-0.5, 0, 0); uniform token physics:axis = "Z";'
+    model = load(*bodies, joint("Revolute", first, (), "J"), joint("Revolute", second + more, (), "K"))
+    assert model.q0 == pytest.approx([math.pi / 2, 0], abs=1e-12)
+    assert model.v0 == pytest.approx([math.pi / 6, 0], abs=1e-12)
+    pose = wl.Simulator(model, device="cpu").body_pose.numpy()[0]
+    assert pose[:, :3] == pytest.approx(np.array([[0, 0.5, 0], [0, 1.5, 0]]), abs=1e-12)
+    assert model.report.notes[-1].startswith("/J: stand and move at the start as state:<axis>")
+    assert not any("state:" in i.what for i in model.report.ignored)
+
+
+def test_joint_state_of_a_d6_joint_in_centimetres():
+    apis = [f"PhysicsLimitAPI:{axis}" for axis in ("transY", "transZ", "rotX", "rotY")]
+    locked = "".join(limit(axis, 1, -1) for axis in ("transY", "transZ", "rotX", "rotY"))
+    model = load(*pair("", locked + "float state:transX:physics:position = 20; float state:rotZ:physics:position = -30;", apis), head=CM)
+    assert model.q0[7:] == pytest.approx([0.2, -math.pi / 6])
+
+
+def test_what_a_joint_moves_at_the_start_is_told():
+    frames = "point3f physics:localPos0 = (0.5, 0, 0); point3f physics:localPos1 = (-0.5, 0.25, 0);"
+    bodies = [body(n, LIGHT + xform(translate=f"({x}, 0, 0)"), inner="") for n, x in (("A", 0), ("B", 1))]
+    model = load(*bodies, joint("Revolute", JOINT + frames))
+    assert "/B does not stand where joints let them: moved there by 0.25 m" in model.report.notes
+
+
+def test_bodies_of_a_stack_pass_through_each_other_with_a_body_between_them():
+    boxes = [body("A", LIGHT, inner=cube()), body("B", LIGHT + xform(translate="(1, 0, 0)"), inner=cube())]
+    for more, pairs in (("", 0), ("bool physics:collisionEnabled = 1;", 1)):
+        hinges = []
+        for name, x in (("h1", 0.25), ("h2", 0.75)):
+            frames = (
+                f'point3f physics:localPos0 = ({x}, 0, 0); point3f physics:localPos1 = ({x - 1}, 0, 0); uniform token physics:axis = "Z";'
+            )
+            hinges.append(joint("Revolute", ENDS + frames + more, (), name))
+        assert len(load(root(*boxes, *hinges)).pairs) == pairs
+
+
+# -- where joints stand: every kind of prim that one may name ------------------------------------------------------------
+
+TURN = np.array([0.2, -0.4, 0.4, 0.8])  # (x y z w)
+PLACE = (0.3, -0.2, 0.5)
+FRAME = f"point3f physics:localPos1 = {PLACE}; quatf physics:localRot1 = (0.8, 0.2, -0.4, 0.4);"
+MOVED = {"translate": "(1, 2, 3)", "rotateXYZ": "(10, 20, 30)"}
+SIMPLE = xform(translate="(0.3, 0, 1)", rotateXYZ="(50, 0, 0)")
+
+
+def world_frame(source, path):
+    """Where FRAME of a prim is in the world, by USD's own transform, and the image of its x axis (stage units)."""
+    from pxr import UsdGeom
+
+    matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(source.GetPrimAtPath(path)))
+    return np.array(PLACE) @ matrix[:3, :3] + matrix[3, :3], rotate(TURN, np.eye(3)[0]) @ matrix[:3, :3]
+
+
+@pytest.mark.parametrize("head", [SI, CM])
+@pytest.mark.parametrize("scale", [None, "(2, 2, 2)", "(2, 3, 0.5)", "(-1, 1, 1)", "(-2, -2, -2)"])
+@pytest.mark.parametrize("case", ["body", "child", "nested body", "body below"])
+def test_frame_of_a_joint_is_where_the_prim_that_it_names_has_it(case, scale, head):
+    """Scaled, slanted, mirrored (which turns angles round), child prims, nested bodies; metres and centimetres."""
+    outer = xform(**MOVED, **({} if scale is None else {"scale": scale}))
+    prims, named = {
+        "body": (body("A", LIGHT + outer, inner=""), "/A"),
+        "child": (body("A", LIGHT + outer, inner=prim("Xform", "K", (), SIMPLE)), "/A/K"),
+        "nested body": (body("A", LIGHT + outer, inner=body("B", LIGHT + SIMPLE, inner="")), "/A/B"),
+        "body below": (prim("Xform", "W", (), outer + body("B", LIGHT + SIMPLE, inner="")), "/W/B"),
+    }[case]
+    source = stage(SCENE, prims, joint("Revolute", f"rel physics:body1 = <{named}>;" + FRAME), head=head)
+    reading = read_usd(source)
+    model = reading.builder.finalize()
+    b = next(b for b in range(model.num_bodies) if model.joint_type[b] == JointType.REVOLUTE)
+    path = model.body_names[b]
+    stands = np.array(reading.builder.pose(b))
+    frame = compose(stands, model.joint_child_pose[b])
+    place, axis = world_frame(source, named)
+    unit = 0.01 if head == CM else 1.0
+    assert frame[:3] == pytest.approx(unit * place, abs=1e-12)
+    if scale != "(2, 3, 0.5)":  # an uneven scale leaves no axis where it is
+        mirrored = -1.0 if scale and "-" in scale else 1.0
+        assert rotate(frame[3:], np.eye(3)[0]) == pytest.approx(mirrored * axis / np.linalg.norm(axis), abs=1e-6)
+    assert path == ("/A" if case == "child" else named)
+
+
+def test_joint_that_names_what_is_no_body_holds_to_the_world_there():
+    static = prim("Xform", "S", (), xform(translate="(5, 0, 0)", rotateXYZ="(0, 0, 90)", scale="(2, 2, 2)"))
+    ends = "rel physics:body0 = </S>; rel physics:body1 = </A>; point3f physics:localPos0 = (1, 0, 0);"
+    model = load(static, body("A", LIGHT + xform(translate="(5, 2, 0)", rotateXYZ="(0, 0, 90)"), inner=""), joint("Revolute", ends))
+    assert model.joint_pose[0] == pytest.approx([5, 2, 0, 0, 0, math.sqrt(0.5), math.sqrt(0.5)], abs=1e-12)
+    assert (model.nq, model.q0[0]) == (1, pytest.approx(0, abs=1e-12))
+
+
+def test_joint_of_a_disabled_body_holds_to_the_world():
+    off = body("B", LIGHT + "bool physics:rigidBodyEnabled = 0;" + xform(translate="(0, 0, 2)"), inner="")
+    model = load(body("A", LIGHT, inner=""), off, joint("Revolute", JOINT + "point3f physics:localPos1 = (0, 0, -2);"))
+    assert (model.dofs, model.joint_pose[0, :3].tolist()) == (1, pytest.approx([0, 0, 0]))
+
+
+def test_joint_that_names_nothing_is_refused():
+    message = refused(body("A", LIGHT, inner=""), joint("Revolute", "rel physics:body0 = </Nope>; rel physics:body1 = </A>;"))
+    assert "/J: physics:body0 names /Nope, which does not exist" in message
+
+
+def test_robots_of_instances_and_their_joints():
+    """Two instances of one robot, 5 apart: each has bodies, joint and articulation of its own, which passes through itself alone."""
+    arms = [body(n, LIGHT + xform(translate=f"({x}, 0, 0)"), inner=cube()) for n, x in (("A", 0), ("B", 1), ("C", 2))]
+    ends = [f"rel physics:body0 = </R/{a}>; rel physics:body1 = </R/{b}>;" for a, b in ("AB", "BC")]
+    frames = "point3f physics:localPos0 = (0.5, 0, 0); point3f physics:localPos1 = (-0.5, 0, 0);"
+    hinges = [joint("Revolute", e + frames, (), n) for n, e in zip(("J", "K"), ends, strict=True)]
+    robot = prim("Xform", "R", ("PhysicsArticulationRootAPI",), "bool newton:selfCollisionEnabled = 0;" + "".join([*arms, *hinges]))
+    copies = [
+        prim("Xform", n, (), xform(translate=f"({x}, 0, 0)"), "instanceable = true\nprepend inherits = </R>")
+        for n, x in (("I", 0), ("K", 5))
+    ]
+    model = load(robot.replace("def Xform", "class Xform", 1), *copies)
+    assert model.joint_names == ("", "/I/J", "/I/K", "", "/K/J", "/K/K")
+    assert model.body_parent.tolist() == [-1, 0, 1, -1, 3, 4]
+    poses = wl.Simulator(model, device="cpu").body_pose.numpy()[0]
+    assert poses[:, 0] == pytest.approx([0, 1, 2, 5, 6, 7])
+    touching = {tuple(sorted(model.shape_body[pair])) for pair in model.pairs}
+    assert touching == {(a, b) for a in range(3) for b in range(3, 6)}
+
+
+def test_joints_in_grams_and_centimetres():
+    """Units of mass and length in armature, damping, friction, drives: g cm^2, g cm^2/s by degree, g cm^2/s^2."""
+    head = CM.replace("kilogramsPerUnit = 1", "kilogramsPerUnit = 0.001")
+    content = "float newton:armature = 3; float newton:damping = 2; float newton:friction = 5; float drive:angular:physics:stiffness = 7;"
+    model = load(*pair("Revolute", content + "float drive:angular:physics:maxForce = 11;", ("PhysicsDriveAPI:angular",)), head=head)
+    unit = 1e-3 * 1e-4
+    found = [model.armature[6], model.damping[6], model.joint_friction[6], model.drive[6, 0], model.drive[6, 2]]
+    assert found == pytest.approx([3 * unit, 2 * unit * 180 / math.pi, 5 * unit, 7 * unit * 180 / math.pi, 11 * unit], rel=1e-9)
+    content = content.replace("angular", "linear")
+    model = load(*pair("Prismatic", content + "float drive:linear:physics:maxForce = 11;", ("PhysicsDriveAPI:linear",)), head=head)
+    found = [model.armature[6], model.damping[6], model.joint_friction[6], model.drive[6, 0], model.drive[6, 2]]
+    assert found == pytest.approx([3e-3, 2e-3, 5e-5, 7e-3, 11e-5], rel=1e-9)
+
+
+def test_what_is_lost_where_a_joint_closes_a_loop_is_told():
+    closes = joint("Revolute", JOINT + "bool physics:excludeFromArticulation = 1; float physics:upperLimit = 10;", name="K")
+    assert any(note.startswith("/K: closes a loop: its limits") for note in load(*pair("Revolute"), closes).report.notes)
+
+
+def test_a_joint_of_several_axes_may_carry_its_first_body():
+    """Only its second body is held: poses and mass matrix are those of the same joint with its bodies exchanged, coordinates reversed."""
+    content = LIGHT + xform(translate="(1, 0, 0)")
+    free = [f"PhysicsLimitAPI:{axis}" for axis in ("transX", "transY", "transZ", "rotZ")]
+    locked = "".join(limit(axis, 1, -1) for axis in ("transX", "transY", "transZ", "rotZ")) + limit("rotY", -20, 30)
+    ends = "rel physics:body0 = </A>; point3f physics:localPos1 = (1, 0, 0);"
+    model = load(body("A", content, inner=""), joint("", ends + locked, (*free, "PhysicsLimitAPI:rotY")))
+    assert model.dofs == 2
+    assert model.limit[0] == pytest.approx(np.radians([-20, 30]))
+    sim, (a, b) = wl.Simulator(model, device="cpu"), (0.3, -0.4)  # about y, then about x: the world turns by R_x(b) R_y(a) in A
+    sim.q.assign(np.array([[a, b]]))
+    pose = sim.body_pose.numpy()[0, 0]
+    x, y = np.array([math.sin(b / 2), 0, 0, math.cos(b / 2)]), np.array([0, math.sin(a / 2), 0, math.cos(a / 2)])
+    assert pose == pytest.approx(inverse(compose(np.r_[0, 0, 0, x], np.r_[0, 0, 0, y])) + np.eye(7)[0], abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["Revolute", "Prismatic"])
+@pytest.mark.parametrize(("limits", "expected"), [({"upper": 10}, (-np.inf, 10)), ({"lower": -10}, (-10, np.inf)), ({}, (-np.inf, np.inf))])
+def test_limits_on_one_side(kind, limits, expected):
+    """The parser enables no limit of an angle that has one side."""
+    content = "".join(f"float physics:{side}Limit = {value};" for side, value in limits.items())
+    unit = math.radians(1) if kind == "Revolute" else 1.0
+    assert load(*pair(kind, content)).limit[6] == pytest.approx(unit * np.array(expected))
+
+
+def test_infinite_limits_that_lock():
+    apis = [f"PhysicsLimitAPI:{axis}" for axis in ("transX", "rotX")]
+    model = load(*pair("", limit("transX", "inf", "-inf") + limit("rotX", -10, "inf"), apis))
+    assert model.dofs == 11
+    assert model.limit[8] == pytest.approx([-math.radians(10), np.inf])  # after ty and tz
+
+
+def test_each_cone_limit_breaking_and_mimic_joint_is_named():
+    one = read(*pair("Spherical", "float physics:coneAngle1Limit = 30;")).report.ignored
+    assert [(i.path, i.what.split()[0]) for i in one] == [("/J", "cone")]
+    mimic = "rel newton:mimicJoint = </K>; float newton:mimicCoef1 = 2;"
+    ignored = read(*pair("Revolute", mimic, ("NewtonMimicAPI",))).report.ignored
+    assert [(i.path, i.what) for i in ignored] == [("/J", "NewtonMimicAPI")]
+    ignored = read(*pair("Revolute", "", ("PhysxMimicJointAPI:rotX",))).report.ignored
+    assert [(i.path, i.what) for i in ignored] == [("/J", "PhysxMimicJointAPI:rotX")]
+    ignored = read(*pair("Revolute", "float physics:breakTorque = 3;")).report.ignored
+    assert [(i.path, i.what) for i in ignored] == [("/J", "physics:breakForce, physics:breakTorque")]

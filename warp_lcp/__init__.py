@@ -18,6 +18,7 @@ _PUBLIC = {
     "Control": "simulator",
     "Drive": "model",
     "JointType": "model",
+    "Combine": "model",
     "Material": "model",
     "MissingExtra": "errors",
     "Model": "model",

@@ -140,14 +140,14 @@ def rows(model: Model) -> list[Row]:
 
 def possible(model: Model, name: str, value: np.ndarray) -> np.ndarray:
     """[..., nv] or [..., nv, 3] which numbers a joint's parameter may have: what is a row of its own, and what a part of M, is settled."""
-    allowed = np.asarray((np.isfinite(value) | (name == "gains")) & (value >= 0.0))
+    allowed: np.ndarray = np.array((np.isfinite(value) | (name == "gains")) & (value >= 0.0))
     if name == "joint_friction":
         has_row = np.isin(np.arange(model.nv), [row.velocity for row in rows(model) if row.kind == int(tree.LIMIT_LOW)])
-        allowed &= has_row | (value == 0.0)
+        allowed = allowed & (has_row | (value == 0.0))
     elif name == "gains":
-        driven, bounded = model.gains[:, :2].any(axis=1), np.isfinite(model.gains[:, 2])
-        allowed[..., :2] &= np.isfinite(value[..., :2]) & (driven[:, None] | (value[..., :2] == 0.0))
-        allowed[..., 2] &= np.isfinite(value[..., 2]) == bounded
+        driven, bounded = (model.gains[:, :2] > 0.0).sum(axis=1) > 0, np.isfinite(model.gains[:, 2])
+        stiff = np.isfinite(value[..., :2]) & (driven[:, None] | (value[..., :2] == 0.0))
+        allowed = allowed & np.concatenate([stiff, (np.isfinite(value[..., 2]) == bounded)[..., None]], axis=-1)
     return allowed
 
 

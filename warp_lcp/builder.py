@@ -13,11 +13,14 @@ import numpy as np
 from . import hulls, joints
 from .errors import ModelError, positive_number
 from .joints import AXES, Joint
-from .model import CONTACT_POINTS, JOINT_AXES, DofKind, Drive, Hull, JointType, Material, Mesh, Model, Report, ShapeType
+from .model import CONTACT_POINTS, JOINT_AXES, Combine, DofKind, Drive, Hull, JointType, Material, Mesh, Model, Report, ShapeType
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 NO_LIMIT, NO_DRIVE = (-np.inf, np.inf), (0.0, 0.0, np.inf, 0.0, 0.0)
+MOVED = 1e-5  # from here on it is told that a joint moves a body [m]
 CONTACT_FIELDS = ("normal_stiffness", "normal_damping", "tangent_stiffness", "tangent_damping", "slip_threshold")
+
+COMBINE_FIELDS = ("friction_combine", "restitution_combine")
 
 
 def rotation_matrix(quat: np.ndarray) -> np.ndarray:
@@ -133,7 +136,7 @@ class ModelBuilder:
             velocity: of the centre of mass, world axes [m/s].
             angular_velocity: world axes [rad/s].
             joint: FREE moves under forces, KINEMATIC moves with its velocity whatever touches it, FIXED does not move.
-            mass: [kg]; omitted: from the densities of the body's shapes.
+            mass: [kg]; omitted: from the densities of the body's shapes. Zero: it hangs on a joint, carries others and has no shape.
             com: centre of mass in the body frame; omitted: from the shapes (the frame's origin without shapes).
             inertia: [3, 3] about the centre of mass, body axes; omitted: from the shapes, scaled to ``mass``.
 
@@ -150,7 +153,7 @@ class ModelBuilder:
                 _pose(name, pose),
                 _vector(f"{name}: velocity", velocity, 3),
                 _vector(f"{name}: angular velocity", angular_velocity, 3),
-                None if mass is None else _positive(f"{name}: mass", mass, "kg"),
+                mass if mass is None or mass == 0.0 else _positive(f"{name}: mass", mass, "kg"),
                 None if com is None else _vector(f"{name}: centre of mass", com, 3),
                 None if inertia is None else _inertia(name, inertia),
             )
@@ -165,15 +168,18 @@ class ModelBuilder:
         *,
         parent_frame: Sequence[float] = IDENTITY,
         child_frame: Sequence[float] = IDENTITY,
-        axes: Sequence[str] | None = None,
+        axes: Sequence[str | tuple[str, Sequence[float]]] | None = None,
         armature: float | Sequence[float] = 0.0,
         damping: float | Sequence[float] = 0.0,
         friction: float | Sequence[float] = 0.0,
         limit: Sequence[Any] | None = None,
         drive: Drive | Sequence[Drive | None] | None = None,
+        start: float | Sequence[float] | None = None,
+        start_velocity: float | Sequence[float] | None = None,
         loop: bool = False,
         collide: bool = False,
         name: str | None = None,
+        axis_names: Sequence[str] | None = None,
     ) -> int:
         """Join two bodies and return the joint's index.
 
@@ -182,15 +188,19 @@ class ModelBuilder:
             parent, child: bodies; -1 = world.
             parent_frame, child_frame: the joint's frame in the frame of either body; they coincide where the joint's coordinates are zero.
                 Where the bodies stand tells the coordinates at the start; a child that does not stand where the joint lets it is moved.
-            axes: what a D6 joint leaves free, of "tx", "ty", "tz", "rx", "ry", "rz".
+            axes: what a D6 joint leaves free, of "tx", "ty", "tz", "rx", "ry", "rz". Or pairs ("t" or "r", direction in the frame), in any
+                order: ways and turns, each as moved by those before it.
             armature: added to the inertia of each coordinate, kg or kg m^2.
             damping: force against the velocity of each coordinate, N s/m or N m s.
             friction: dry friction of each coordinate, N or N m.
             limit: least and greatest coordinate (a pair for each, where there are several); infinite or None: no limit.
             drive: what pulls each coordinate.
+            start: coordinates at the start, as in q; omitted or NaN: those nearest to where the bodies stand. What hangs on the child is
+                carried along.
+            start_velocity: of each coordinate; omitted or NaN: what the velocities of the bodies leave for it.
             loop: never carry the child by this joint, hold both bodies where they are.
             collide: let the shapes of the two bodies touch, and those of what hangs rigidly on them.
-            name: 'joint<i>' if omitted.
+            name: 'joint<i>' if omitted. axis_names: of each coordinate; the joint's if omitted.
 
         Raises:
             ModelError: for a joint that is none, or a number that is not finite or negative.
@@ -204,17 +214,15 @@ class ModelBuilder:
         type = JointType(type)
         if type in (JointType.FREE, JointType.KINEMATIC):
             raise ModelError(f"{name}: {type.name} is no joint between bodies; say so in add_body")
+        directions = None
         if type is JointType.D6:
-            free = tuple(axes or ())
-            if any(a not in AXES for a in free) or len(set(free)) != len(free):
-                raise ModelError(f"{name}: axes are {free}; give some of {', '.join(AXES)}, each once")
-            free = tuple(a for a in AXES if a in free)
+            free, directions = _axes(name, tuple(axes or ()))
         elif axes is not None:
             raise ModelError(f"{name}: axes are for D6 joints, not for {type.name}")
         else:
             free = JOINT_AXES[type]
         n = len(free)
-        limits, drives = _limits(name, limit, n), _drives(name, drive, n)
+        limits, (drives, by_inertia) = _limits(name, limit, n), _drives(name, drive, n)
         if type is JointType.SPHERICAL and (np.isfinite(limits).any() or drives[:, :2].any()):
             raise ModelError(f"{name}: a SPHERICAL joint has no angles to limit or drive; use D6 with axes rx ry rz")
         self._joints.append(
@@ -233,6 +241,11 @@ class ModelBuilder:
                 drives,
                 collide=collide,
                 loop=loop,
+                directions=directions,
+                start=None if start is None else _start(f"{name}: start", start, 4 if type is JointType.SPHERICAL else n),
+                start_velocity=None if start_velocity is None else _start(f"{name}: start velocity", start_velocity, n),
+                acceleration=by_inertia,
+                names=None if axis_names is None else tuple(axis_names),
             )
         )
         return len(self._joints) - 1
@@ -393,6 +406,10 @@ class ModelBuilder:
         self._shapes.append(_Shape(name, kind, body, _pose(name, pose), size, material, float(density), velocity, hull))
         return len(self._shapes) - 1
 
+    def pose(self, body: int) -> list[float]:
+        """Where a body was said to stand (x y z qx qy qz qw)."""
+        return self._bodies[body].pose.tolist()
+
     def filter_pair(self, shape_a: int, shape_b: int) -> None:
         """Let two shapes pass through each other."""
         self._filtered.add((min(shape_a, shape_b), max(shape_a, shape_b)))
@@ -407,9 +424,20 @@ class ModelBuilder:
             raise ModelError("nothing can move: the scene has no free and no kinematic body; add one (in USD: PhysicsRigidBodyAPI)")
         mass, com, inertia = (np.array(x) for x in zip(*(self._mass_properties(i) for i in range(len(self._bodies))), strict=True))
         shapes = self._shapes
+        forest, moved, loops = self._forest(mass, com, inertia)
+        report = Report() if report is None else report
+        if moved:
+            far, worst = max(moved)
+            what = f"{len(moved)} bodies do" if len(moved) > 1 else f"{worst} does"
+            which = f", {worst} by {far:.3g} m" if len(moved) > 1 else f" by {far:.3g} m"
+            report = replace(report, notes=(*report.notes, f"{what} not stand where joints let them: moved there{which}"))
+        lost = [joint.name for joint in loops if joint.distance is None and _acts(joint)]
+        if lost:
+            what = "limits, drive, damping and dry friction act only on joints that carry a body"
+            report = replace(report, notes=(*report.notes, *(f"{name}: closes a loop: its {what}" for name in lost)))
         model = Model(
             body_names=tuple(b.name for b in self._bodies),
-            **self._forest(com),
+            **forest,
             mass=mass,
             com=com,
             inertia=inertia,
@@ -423,17 +451,27 @@ class ModelBuilder:
             friction=np.array([(s.material.static_friction, s.material.dynamic_friction) for s in shapes], dtype=float).reshape(-1, 2),
             contact=np.array([[getattr(s.material, f) for f in CONTACT_FIELDS] for s in shapes], dtype=float).reshape(-1, 5),
             restitution=np.array([s.material.restitution for s in shapes], dtype=float),
+            combine=np.array([[getattr(s.material, f) for f in COMBINE_FIELDS] for s in shapes], dtype=np.int32).reshape(-1, 2),
             pairs=np.zeros((0, 2), dtype=np.int32),
             gravity=self.gravity.copy(),
             up_axis=self.up_axis,
-            report=Report() if report is None else report,
+            report=report,
         )
         return replace(model, pairs=self._pairs(model))
 
-    def _forest(self, com: np.ndarray) -> dict[str, Any]:
-        """Model's fields of bodies, joints and coordinates; coordinates in the order of the tree, parents first."""
+    def _forest(
+        self, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray
+    ) -> tuple[dict[str, Any], list[tuple[float, str]], list[Joint]]:
+        """Model's fields of bodies, joints and coordinates, which are in the order of the tree, parents first; what joints move at the
+        start although they have no coordinate for it, by how much [m]; joints that close loops."""
         bodies, count = self._bodies, len(self._bodies)
         carried, order, loops = joints.forest([b.name for b in bodies], [b.joint for b in bodies], self._joints)
+        carries = {joint.parent for joint in carried if joint is not None}
+        for b, body in enumerate(bodies):
+            if body.mass == 0.0 and (carried[b] is None or b not in carries or any(s.body == b for s in self._shapes)):
+                raise ModelError(
+                    f"{body.name}: mass is 0 kg; only what hangs on a joint, carries another body and has no shape may have none"
+                )
         types, parents = [b.joint for b in bodies], np.full(count, -1, dtype=np.int32)
         frames, child_frames = np.tile(IDENTITY, (count, 1)), np.tile(IDENTITY, (count, 1))
         poses = np.array([b.pose for b in bodies])
@@ -441,6 +479,11 @@ class ModelBuilder:
         q0: list[np.ndarray] = []
         v0: list[np.ndarray] = []
         dofs: list[tuple[Any, ...]] = []
+        joint_names, dof_names = [""] * count, list[str]()
+        axes: list[np.ndarray] = []  # [6, n] of each body's velocities, at the world's origin
+        by_inertia: list[int] = []  # drives that ask for accelerations
+        moved: list[tuple[float, str]] = []
+        carriers: dict[int, np.ndarray] = {}  # by which displacement a body is carried from where it was said to stand
         twists = np.zeros((count + 1, 6))  # velocity at the world's origin, angular velocity; the world's own is the last
         for b in order:
             body, joint = bodies[b], carried[b]
@@ -452,46 +495,80 @@ class ModelBuilder:
                 kind = DofKind.FREE if body.joint is JointType.FREE else DofKind.PRESCRIBED
                 q0.append(body.pose)
                 v0.append(np.r_[body.velocity, body.angular_velocity])
+                dof_names += [body.name] * 6
                 dofs += [(b, kind, np.eye(3)[k % 3], 0.0, 0.0, 0.0, NO_LIMIT, NO_DRIVE) for k in range(6)]
                 centre = body.pose[:3] + joints.rotate(body.pose[3:], com[b])
+                turns = np.r_[np.cross(centre, np.eye(3)).T, np.eye(3)]
+                axes.append(np.c_[np.eye(6, 3), turns] if kind is DofKind.FREE else np.zeros((6, 6)))
                 twists[b] = np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
                 continue
             types[b], parents[b], frames[b], child_frames[b] = joint.type, joint.parent, joint.parent_frame, joint.child_frame
             if joint.type is JointType.FIXED:  # one frame is enough
                 frames[b], child_frames[b] = joints.compose(joint.parent_frame, joints.inverse(joint.child_frame)), np.array(IDENTITY)
             frame = joint.parent_frame if joint.parent < 0 else joints.compose(poses[joint.parent], joint.parent_frame)
-            q = joints.coordinates(joint, joints.compose(joints.inverse(frame), joints.compose(body.pose, joint.child_frame)))
+            # What a joint with a given coordinate carries stands as if carried there.
+            carried_by = carriers.get(joint.parent)
+            asked_pose = body.pose if carried_by is None else joints.compose(carried_by, body.pose)
+            q = joints.coordinates(joint, joints.compose(joints.inverse(frame), joints.compose(asked_pose, joint.child_frame)))
+            if joint.start is not None:
+                q = np.where(np.isnan(joint.start), q, joint.start)
             placed = joints.compose(frame, joints.pose_of(joint, q))
             poses[b] = joints.compose(placed, joints.inverse(joint.child_frame))
+            if joint.start is None:  # the child's frame is the joint's: what turns there does not count as moved
+                away = float(np.linalg.norm(placed[:3] - joints.compose(asked_pose, joint.child_frame)[:3]))
+                if away > MOVED:
+                    moved.append((away, body.name))
+            if joint.start is not None:
+                carried_by = joints.compose(poses[b], joints.inverse(body.pose))
+            if carried_by is not None:
+                carriers[b] = carried_by
             columns = joints.columns(joint, frame, q)
             centre = poses[b][:3] + joints.rotate(poses[b][3:], com[b])
             asked = np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
             v = np.linalg.lstsq(columns, asked - twists[joint.parent], rcond=None)[0] if any(asked) else np.zeros(columns.shape[1])
+            if joint.start_velocity is not None:
+                v = np.where(np.isnan(joint.start_velocity), v, joint.start_velocity)
             twists[b] = twists[joint.parent] + columns @ v
             q0.append(q)
             v0.append(v)
-            axis = [np.eye(3)["xyz".index(a[1])] for a in joint.axes]
+            axis = joints.directions(joint)
+            axes.append(columns)
+            if joint.acceleration is not None:
+                by_inertia += (len(dofs) + np.flatnonzero(joint.acceleration)).tolist()
+            joint_names[b], dof_names = joint.name, [*dof_names, *(joint.names or [joint.name] * len(axis))]
             numbers = (joint.armature, joint.damping, joint.friction, joint.limit, joint.drive)
             dofs += list(zip([b] * len(axis), joints.kinds(joint), axis, *numbers, strict=True))
         columns_of = list(zip(*dofs, strict=True))
-        return {
-            "body_parent": parents,
-            "joint_type": np.array(types, dtype=np.int32),
-            "joint_pose": frames,
-            "joint_child_pose": child_frames,
-            **starts,
-            "q0": np.concatenate(q0),
-            "v0": np.concatenate(v0),
-            "dof_body": np.array(columns_of[0], dtype=np.int32),
-            "dof_kind": np.array(columns_of[1], dtype=np.int32),
-            "dof_axis": np.array(columns_of[2], dtype=float),
-            "armature": np.array(columns_of[3], dtype=float),
-            "damping": np.array(columns_of[4], dtype=float),
-            "joint_friction": np.array(columns_of[5], dtype=float),
-            "limit": np.array(columns_of[6], dtype=float).reshape(-1, 2),
-            "drive": np.array(columns_of[7], dtype=float).reshape(-1, 5),
-            "loops": tuple(joints.loop_of(joint) for joint in loops),
-        }
+        drive = np.array(columns_of[7], dtype=float).reshape(-1, 5)
+        if by_inertia:
+            owner, armature = np.array(columns_of[0]), np.array(columns_of[3], dtype=float)
+            matrix = joints.mass_matrix(parents, order, owner, np.concatenate(axes, axis=1), poses, mass, com, inertia)
+            matrix[np.diag_indices(len(owner))] += armature
+            drive[by_inertia, :2] /= np.linalg.inv(matrix)[by_inertia, by_inertia, None]
+        return (
+            {
+                "body_parent": parents,
+                "joint_names": tuple(joint_names),
+                "dof_names": tuple(dof_names),
+                "joint_type": np.array(types, dtype=np.int32),
+                "joint_pose": frames,
+                "joint_child_pose": child_frames,
+                **starts,
+                "q0": np.concatenate(q0),
+                "v0": np.concatenate(v0),
+                "dof_body": np.array(columns_of[0], dtype=np.int32),
+                "dof_kind": np.array(columns_of[1], dtype=np.int32),
+                "dof_axis": np.array(columns_of[2], dtype=float),
+                "armature": np.array(columns_of[3], dtype=float),
+                "damping": np.array(columns_of[4], dtype=float),
+                "joint_friction": np.array(columns_of[5], dtype=float),
+                "limit": np.array(columns_of[6], dtype=float).reshape(-1, 2),
+                "drive": drive,
+                "loops": tuple(joints.loop_of(joint) for joint in loops),
+            },
+            moved,
+            loops,
+        )
 
     @property
     def welded(self) -> set[int]:
@@ -509,7 +586,7 @@ class ModelBuilder:
                 parts.append((m, s.pose[:3] + rot @ centre, m * rot @ inertia @ rot.T))
         if parts:
             mass, com, inertia = compose_mass(parts)
-        elif body.mass is None and index in self.welded:
+        elif body.mass == 0.0 or (body.mass is None and index in self.welded):
             mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
         elif body.joint is JointType.FREE:
             if body.mass is None or body.inertia is None:
@@ -521,7 +598,7 @@ class ModelBuilder:
             shift = com - body.com
             inertia = inertia + mass * (shift @ shift * np.eye(3) - np.outer(shift, shift))
             com = body.com
-        if body.mass is not None:
+        if body.mass:
             mass, inertia = body.mass, inertia * (body.mass / mass)
         return mass, com, inertia if body.inertia is None else body.inertia
 
@@ -566,9 +643,37 @@ def _per_axis(what: str, value: float | Sequence[float], n: int) -> np.ndarray:
     return array.copy()
 
 
+def _axes(name: str, given: tuple[Any, ...]) -> tuple[tuple[str, ...], np.ndarray | None]:
+    """Of a D6 joint: names, and directions where they are not those of the names."""
+    if all(isinstance(a, str) for a in given):
+        if any(a not in AXES for a in given) or len(set(given)) != len(given):
+            raise ModelError(f"{name}: axes are {given}; give some of {', '.join(AXES)}, each once")
+        return tuple(a for a in AXES if a in given), None
+    if any(isinstance(a, str) or len(a) != 2 or a[0] not in ("t", "r") for a in given):
+        raise ModelError(f"{name}: axes are {given}; give names alone, or pairs of 't' or 'r' and a direction alone")
+    vectors = np.array([_vector(f"{name}: axis", direction, 3) for _, direction in given])
+    length = np.linalg.norm(vectors, axis=1)
+    if not length.all() or len(given) > 6:
+        raise ModelError(f"{name}: axes are {given}; give six at most, none of no length")
+    return tuple(kind for kind, _ in given), vectors / length[:, None]
+
+
+def _acts(joint: Joint) -> bool:
+    """Does anything but what it holds act along the joint?"""
+    return bool(np.isfinite(joint.limit).any() or joint.drive[:, :2].any() or joint.damping.any() or joint.friction.any())
+
+
+def _start(what: str, value: float | Sequence[float], n: int) -> np.ndarray:
+    """[n], NaN where it is open."""
+    given = np.atleast_1d(np.asarray(value, dtype=float))
+    if given.shape != (n,) or np.isinf(given).any():
+        raise ModelError(f"{what} is {given.tolist()}; give {n} numbers, NaN where the bodies tell")
+    return given
+
+
 def _limits(name: str, value: Sequence[Any] | None, n: int) -> np.ndarray:
     """[n, 2]"""
-    pairs = [value] if n == 1 and value is not None and np.ndim(value[0]) == 0 else value
+    pairs = [value] if n == 1 and value is not None and len(value) == 2 and np.ndim(value[0]) == 0 else value
     limits = np.tile(np.array(NO_LIMIT), (n, 1))
     if pairs is None:
         return limits
@@ -582,8 +687,8 @@ def _limits(name: str, value: Sequence[Any] | None, n: int) -> np.ndarray:
     return limits
 
 
-def _drives(name: str, value: Drive | Sequence[Drive | None] | None, n: int) -> np.ndarray:
-    """[n, 5]"""
+def _drives(name: str, value: Drive | Sequence[Drive | None] | None, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """[n, 5], and [n] which are of type acceleration."""
     drives = [value] * n if value is None or isinstance(value, Drive) else list(value)
     if len(drives) != n:
         raise ModelError(f"{name}: {len(drives)} drives; give {n}, one for each coordinate")
@@ -591,7 +696,7 @@ def _drives(name: str, value: Drive | Sequence[Drive | None] | None, n: int) -> 
     table = table.reshape(n, 5)
     if not ((table[:, :3] >= 0.0).all() and np.isfinite(table[:, [0, 1, 3, 4]]).all()):
         raise ModelError(f"{name}: drive {table.tolist()}: gains and force must not be negative, and all but the force finite")
-    return table
+    return table, np.array([d is not None and d.acceleration for d in drives], dtype=bool)
 
 
 _positive = partial(positive_number, error=ModelError)
@@ -630,6 +735,8 @@ def _inertia(name: str, value: Sequence[Sequence[float]]) -> np.ndarray:
 def _check_material(name: str, material: Material) -> None:
     for f in fields(material):
         value = getattr(material, f.name)
+        if f.name in COMBINE_FIELDS and value not in tuple(Combine):
+            raise ModelError(f"{name}: {f.name} is {value}; give one of {', '.join(f'Combine.{mode.name}' for mode in Combine)}")
         if value is None:
             continue
         strict = f.name in CONTACT_FIELDS and f.name != "tangent_stiffness" and f.name != "normal_stiffness"

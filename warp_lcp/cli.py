@@ -141,12 +141,15 @@ def describe(reading: SceneReading, law: Law | None = None) -> dict[str, Any]:
     else:
         try:
             model = reading.builder.finalize(report)
+            report = model.report
         except ModelError as error:
             obstacle = str(error)
     facts: dict[str, Any] = {"scene": reading.source, "simulable": model is not None, "obstacle": obstacle}
-    facts |= {"bodies": [{"name": n, "joint": None, "mass": None, "dofs": None} for n in reading.bodies], "joints": list(reading.joints)}
-    facts |= {"dofs": None, "shapes": [{"name": n, "type": None, "body": None} for n in reading.shapes], "pairs": None}
-    facts |= {"contact_slots": None, "max_contacts": None, "joint_rows": None, "largest_lcp": None, "bytes_per_env": None, "kernels": None}
+    facts |= {"bodies": [{"name": n, "joint": None, "mass": None, "dofs": None} for n in reading.bodies]}
+    facts |= {"joints": [{"name": n, "type": None} for n in reading.joints]}
+    facts |= {"shapes": [{"name": n, "type": None, "body": None} for n in reading.shapes]}
+    unknown = ("dofs", "pairs", "contact_slots", "max_contacts", "joint_rows", "joint_row_kinds", "largest_lcp", "bytes_per_env", "kernels")
+    facts |= dict.fromkeys(unknown)
     if model is not None:
         facts |= _model_facts(model, law or Law())
     facts["friction"] = (law or Law()).friction
@@ -160,6 +163,7 @@ def describe(reading: SceneReading, law: Law | None = None) -> dict[str, Any]:
 def _model_facts(model: Model, law: Law) -> dict[str, Any]:
     import numpy as np
 
+    from . import cli_joints
     from .model import DofKind, JointType, ShapeType
 
     bodies, shapes = [], []
@@ -170,13 +174,13 @@ def _model_facts(model: Model, law: Law) -> dict[str, Any]:
     for name, kind, body in zip(model.shape_names, model.shape_type, model.shape_body, strict=True):
         shapes.append({"name": name, "type": ShapeType(kind).name.lower(), "body": model.body_names[body] if body >= 0 else None})
     pairs = [[model.shape_names[a], model.shape_names[b]] for a, b in model.pairs]
-    return ledger(model, law) | {"bodies": bodies, "shapes": shapes, "pairs": pairs}
+    return ledger(model, law) | {"bodies": bodies, "shapes": shapes, "pairs": pairs, "joints": cli_joints.describe(model)}
 
 
 def ledger(model: Model, law: Law | None = None) -> dict[str, Any]:
     """What a model takes under a contact law: degrees of freedom, contact slots, contacts, rows of joints and unknowns of the LCP
     at most (None where the law is none), bytes of one more environment, names of the kernels."""
-    from . import articulation
+    from . import articulation, cli_joints
     from .methods import LCP_UNKNOWNS
     from .simulator import kernel_names
 
@@ -187,6 +191,7 @@ def ledger(model: Model, law: Law | None = None) -> dict[str, Any]:
         "contact_slots": model.num_slots,
         "max_contacts": model.max_contacts,
         "joint_rows": joint_rows,
+        "joint_row_kinds": cli_joints.row_kinds(model),
         "largest_lcp": None if law.is_cone else min(model.max_contacts + joint_rows, LCP_UNKNOWNS // law.unknowns) * law.unknowns,
         "bytes_per_env": bytes_per_env(model, law),
         "kernels": kernel_names(model, law=law),
@@ -220,7 +225,7 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
                 continue
             if (name == "slip" and not law.is_cone) or (name in ("hit", "alert") and not model.bodies_meet):
                 continue
-            if name in ("coefficient", "again"):  # for all alike
+            if name in ("coefficient", "combine", "again"):  # for all alike
                 continue
             number = (len(model.shape_body) if model.bounded else 0) if name == "bounds" else 1 if variable.type.ndim == 1 else width
             total += wp.types.type_size_in_bytes(variable.type.dtype) * number
@@ -230,7 +235,10 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
 def _shown_lcp(facts: dict[str, Any]) -> str:
     if not facts["simulable"]:
         return "?"
-    rows = f"{facts['max_contacts']} contacts" + (f", {facts['joint_rows']} rows of joints" if facts["joint_rows"] else "")
+    rows = f"{facts['max_contacts']} contacts"
+    if facts["joint_rows"]:
+        kinds = ", ".join(f"{number} {kind}" for kind, number in facts["joint_row_kinds"].items() if number)
+        rows += f", {facts['joint_rows']} of joints: {kinds}"
     if facts["largest_lcp"] is None:
         return f"none, the cone itself ({rows})"
     return f"{facts['largest_lcp']} unknowns ({rows})"
@@ -263,7 +271,12 @@ def _print_info(facts: dict[str, Any]) -> None:
     shapes = [(s["name"], _shown(s["type"]), s["body"] or ("world" if facts["simulable"] else "?")) for s in facts["shapes"]]
     console.print(_table(f"shapes: {len(shapes)}", ("name", "type", "body"), shapes))
     if facts["joints"]:
-        console.print(_table(f"joints: {len(facts['joints'])}", ("name",), ((j,) for j in facts["joints"])))
+        from . import cli_joints
+
+        listed = cli_joints.cells(facts["joints"])
+        used = [k for k in range(len(cli_joints.HEADER)) if k < 4 or any(row[k] for row in listed)]
+        header = tuple(cli_joints.HEADER[k] for k in used)
+        console.print(_table(f"joints: {len(facts['joints'])}", header, (tuple(row[k] for k in used) for row in listed)))
     for what in ("unsupported", "ignored"):
         if facts[what]:
             rows = ((i["path"], i["what"], i["why"]) for i in facts[what])
@@ -554,7 +567,7 @@ def _print_summary(facts: dict[str, Any]) -> None:
 def _console() -> Any:
     from rich.console import Console
 
-    return Console(width=None if sys.stdout.isatty() else 160)
+    return Console(width=None if sys.stdout.isatty() else 160, emoji=False)  # :x: is part of a name
 
 
 def _table(title: str, header: tuple[str, ...], rows: Any) -> Any:

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From bodies and the joints between them to a forest of kinematic trees: which joint carries which body, and where it stands."""
+"""From bodies and the joints between them to a forest of kinematic trees: which joint carries which body, and where it stands.
+
+A joint is a sequence of ways and turns, each along or about an axis as moved by those before it. Those of D6 joints lie along the axes of
+the frame, ways first; where ``Joint.directions`` says so they lie anywhere, in any order.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,17 @@ from .errors import ModelError
 from .model import DofKind, JointType, Loop, parents_first
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
+SEARCH_ROUNDS = 100  # of coordinates nearest to a pose
 
 
 @dataclass
 class Joint:
-    """A joint between two bodies, -1 = the world; ``axes`` are free. Frames (x y z qx qy qz qw) in the bodies' own frames."""
+    """A joint between two bodies, -1 = the world; ``axes`` are free. Frames (x y z qx qy qz qw) in the bodies' own frames.
+
+    ``directions`` [n, 3]: where the axes lie in the frame; ``axes`` are then "t" and "r". None: where their names say.
+    ``start``, ``start_velocity``: coordinates at the start and their velocities; None or NaN: those nearest to what the bodies do.
+    ``acceleration`` [n]: which drives have gains for each kg or kg m^2 that the joint sees. ``names`` [n]: of the axes, None: the joint's.
+    """
 
     name: str
     type: JointType
@@ -32,6 +42,11 @@ class Joint:
     distance: tuple[float, float] | None = None
     collide: bool = False
     loop: bool = False
+    directions: np.ndarray | None = None
+    start: np.ndarray | None = None
+    start_velocity: np.ndarray | None = None
+    acceleration: np.ndarray | None = None
+    names: tuple[str, ...] | None = None
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -59,10 +74,16 @@ def inverse(a: np.ndarray) -> np.ndarray:
     return np.r_[-rotate(back, a[:3]), back]
 
 
-def about(axis: int, angle: float) -> np.ndarray:
-    turn = np.zeros(4)
-    turn[axis], turn[3] = np.sin(0.5 * angle), np.cos(0.5 * angle)
-    return turn
+def about(axis: int | np.ndarray, angle: float) -> np.ndarray:
+    direction = np.eye(3)[axis] if isinstance(axis, int) else axis
+    return np.r_[np.sin(0.5 * angle) * direction, np.cos(0.5 * angle)]
+
+
+def directions(joint: Joint) -> np.ndarray:
+    """[n, 3] of the joint's axes in its frame."""
+    if joint.directions is not None:
+        return joint.directions
+    return np.array([np.eye(3)["xyz".index(axis[1])] for axis in joint.axes]).reshape(-1, 3)
 
 
 def kinds(joint: Joint) -> list[DofKind]:
@@ -74,11 +95,29 @@ def kinds(joint: Joint) -> list[DofKind]:
 
 def coordinates(joint: Joint, pose: np.ndarray) -> np.ndarray:
     """q nearest to a pose of the frame on the child in that on the parent."""
+    if joint.directions is not None:
+        return _searched(joint, pose)
     q = [pose["xyz".index(axis[1])] for axis in joint.axes if axis[0] == "t"]
     turn = pose[3:] if pose[6] >= 0.0 else -pose[3:]
     if joint.type is JointType.SPHERICAL:
         return np.r_[q, turn]
     return np.r_[q, _angles(["xyz".index(axis[1]) for axis in joint.axes if axis[0] == "r"], turn)]
+
+
+def _searched(joint: Joint, pose: np.ndarray) -> np.ndarray:
+    """The same where the axes lie anywhere: Gauss and Newton's method from zero, m beside rad."""
+    q = np.zeros(len(joint.axes))
+    for _ in range(SEARCH_ROUNDS):
+        here = pose_of(joint, q)
+        turn = multiply(pose[3:], conjugate(here[3:]))
+        error = np.r_[pose[:3] - here[:3], 2.0 * (turn[:3] if turn[3] >= 0.0 else -turn[:3])]
+        rates = columns(joint, np.r_[np.zeros(6), 1.0], q)
+        rates[:3] += np.cross(rates[3:].T, here[:3]).T  # of the frame on the child
+        change = np.linalg.lstsq(rates, error, rcond=1e-6)[0]
+        q += change
+        if np.abs(change).max(initial=0.0) < 1e-14:
+            break
+    return q
 
 
 def _angles(axes: list[int], turn: np.ndarray) -> np.ndarray:
@@ -104,15 +143,14 @@ def _angles(axes: list[int], turn: np.ndarray) -> np.ndarray:
 def pose_of(joint: Joint, q: np.ndarray) -> np.ndarray:
     """Pose of the frame on the child in that on the parent."""
     pose = np.r_[np.zeros(6), 1.0]
-    ways = [axis for axis in joint.axes if axis[0] == "t"]
-    for axis, value in zip(ways, q, strict=False):
-        pose["xyz".index(axis[1])] = value
-    rest = q[len(ways) :]
     if joint.type is JointType.SPHERICAL:
-        pose[3:] = rest / np.linalg.norm(rest)
-    else:
-        for axis, value in zip([axis for axis in joint.axes if axis[0] == "r"], rest, strict=True):
-            pose[3:] = multiply(pose[3:], about("xyz".index(axis[1]), value))
+        pose[3:] = q / np.linalg.norm(q)
+        return pose
+    for axis, direction, value in zip(joint.axes, directions(joint), q, strict=True):
+        if axis[0] == "t":
+            pose[:3] += value * rotate(pose[3:], direction)
+        else:
+            pose[3:] = multiply(pose[3:], about(direction, value))
     return pose
 
 
@@ -122,17 +160,42 @@ def columns(joint: Joint, frame: np.ndarray, q: np.ndarray) -> np.ndarray:
     spherical = joint.type is JointType.SPHERICAL
     if spherical:
         turn = multiply(turn, q / np.linalg.norm(q))
-    for axis, value in zip(joint.axes, q, strict=False):
-        k = "xyz".index(axis[1])
-        direction = rotate(turn, np.eye(3)[k])
+    for axis, own, value in zip(joint.axes, directions(joint), q, strict=False):
+        direction = rotate(turn, own)
         if axis[0] == "t":
             x += value * direction
             result.append(np.r_[direction, np.zeros(3)])
         else:
             result.append(np.r_[np.cross(x, direction), direction])
             if not spherical:
-                turn = multiply(turn, about(k, value))
+                turn = multiply(turn, about(own, value))
     return np.array(result).reshape(-1, 6).T
+
+
+def mass_matrix(
+    parents: np.ndarray,
+    order: list[int],
+    owner: np.ndarray,
+    axes: np.ndarray,
+    poses: np.ndarray,
+    mass: np.ndarray,
+    com: np.ndarray,
+    inertia: np.ndarray,
+) -> np.ndarray:
+    """[nv, nv] M without armature; ``axes`` [6, nv] twists at the world's origin, zero where they are prescribed: M_ii is 1 there.
+
+    For once, at the start: a simulator has its own (kernels/tree.py).
+    """
+    matrix, paths = np.zeros((axes.shape[1],) * 2), {-1: np.zeros(0, dtype=int)}
+    for b in order:
+        path = paths[b] = np.r_[paths[int(parents[b])], np.flatnonzero(owner == b)]
+        centre = poses[b, :3] + rotate(poses[b, 3:], com[b])
+        turn = np.array([rotate(poses[b, 3:], e) for e in np.eye(3)])
+        velocity, spin = axes[:3, path] + np.cross(axes[3:, path].T, centre).T, turn @ axes[3:, path]
+        matrix[np.ix_(path, path)] += mass[b] * velocity.T @ velocity + spin.T @ inertia[b] @ spin
+    still = ~axes.any(axis=0)
+    matrix[still, still] = 1.0
+    return matrix
 
 
 def forest(names: list[str], types: list[JointType], joints: list[Joint]) -> tuple[list[Joint | None], list[int], list[Joint]]:
@@ -173,25 +236,48 @@ def forest(names: list[str], types: list[JointType], joints: list[Joint]) -> tup
 
 def loop_of(joint: Joint) -> Loop:
     """The same joint as a constraint."""
+    if joint.directions is not None:
+        raise ModelError(f"{joint.name}: a joint of stacked axes cannot close a loop; let one of its bodies hang on it")
     x, y, z, rx, ry, rz = (axis not in joint.axes for axis in AXES)
     frames = np.array([joint.parent_frame, joint.child_frame])
     return Loop(joint.name, (joint.parent, joint.child), frames, (x, y, z), (rx, ry, rz), joint.distance)
 
 
 def turned(joint: Joint) -> Joint:
-    """The same joint followed from its child to its parent; its coordinate keeps its sign (a ball's turns the other way)."""
-    if len(joint.axes) > 1 and joint.type is not JointType.SPHERICAL:
-        raise ModelError(
-            f"{joint.name}: the first body of this {joint.type.name} joint would hang on its second; exchange them, or fix the first"
+    """The same joint followed back: coordinates keep their signs (a ball's turns the other way), not their order."""
+    if (len(joint.axes) > 1 or joint.directions is not None) and joint.type is not JointType.SPHERICAL:
+        per_axis = {n: getattr(joint, n)[::-1] for n in ("armature", "damping", "friction", "limit", "drive")}
+        per_axis |= {
+            n: None if getattr(joint, n) is None else getattr(joint, n)[::-1] for n in ("start", "start_velocity", "acceleration", "names")
+        }
+        return replace(
+            joint,
+            type=JointType.D6,
+            parent=joint.child,
+            child=joint.parent,
+            parent_frame=joint.child_frame,
+            child_frame=joint.parent_frame,
+            axes=tuple(axis[0] for axis in joint.axes[::-1]),
+            directions=-directions(joint)[::-1],
+            **per_axis,
         )
     half = np.array([0.0, 0.0, 0.0, 1.0])
     if len(joint.axes) == 1:  # about another axis by a half turn: the free axis then points the other way
         half = about(("xyz".index(joint.axes[0][1]) + 1) % 3, np.pi)
     half = np.r_[np.zeros(3), half]
+    start, rate = joint.start, joint.start_velocity
+    if joint.type is JointType.SPHERICAL:
+        if rate is not None:
+            if start is None:
+                raise ModelError(f"{joint.name}: a velocity at the start needs coordinates there, as its first body hangs on its second")
+            rate = -rotate(start, rate)  # from axes of the child to those of the parent
+        start = start if start is None else conjugate(start)
     return replace(
         joint,
         parent=joint.child,
         child=joint.parent,
         parent_frame=compose(joint.child_frame, half),
         child_frame=compose(joint.parent_frame, half),
+        start=start,
+        start_velocity=rate,
     )

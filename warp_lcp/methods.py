@@ -119,8 +119,6 @@ class AssembledLCP(Method):
     """A method for dense LCPs ('lemke', 'murty' or 'judice_pires') on the assembled LCP of eq. 39, no fallback."""
 
     def __init__(self, solver: str, model: Model, real: Any, law: Law):
-        if model.loops:
-            raise WarpLcpError(f"method {solver!r} takes no joints that close loops yet; choose auto, proximal_newton or pgs")
         if law.has_generators and model.articulated and articulation.rows(model):
             raise WarpLcpError(
                 f"method {solver!r} takes no limits and drives with {law.formulation!r}; choose auto, proximal_newton or pgs"
@@ -130,13 +128,13 @@ class AssembledLCP(Method):
     def prepare(self, sim: Simulator) -> None:
         real = sim.real
         r = min(sim.rows.slot.shape[1], LCP_UNKNOWNS // sim.law.unknowns)
-        n = r * sim.law.unknowns
-        slots = workspaces(sim.num_envs, 2 * n * n + 15 * r * r, sim.device)
+        n, rows = r * sim.law.unknowns, (3 if sim.model.loops else 2) * r  # rows that are eliminated, at most
+        slots = workspaces(sim.num_envs, 2 * n * n + 9 * r * r + rows * (rows + r), sim.device)
         self.lcp = lcp_workspace(real, slots, n, sim.device)
         ws = lcp.functions(real).ContactWorkspace()
         ws.W = wp.empty((slots, 3 * r, 3 * r), dtype=real, device=sim.device)
-        ws.A_inv = wp.empty((slots, 2 * r, 2 * r), dtype=real, device=sim.device)
-        ws.G = wp.empty((slots, 2 * r, r + 1), dtype=real, device=sim.device)
+        ws.A_inv = wp.empty((slots, rows, rows), dtype=real, device=sim.device)
+        ws.G = wp.empty((slots, rows, r + 1), dtype=real, device=sim.device)
         ws.friction = wp.empty((slots, r + 1), dtype=int, device=sim.device)
         ws.start = wp.empty((slots, r + 1), dtype=int, device=sim.device)
         self.contacts = ws

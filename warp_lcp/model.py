@@ -18,7 +18,8 @@ SPHERICAL  4    3    q: quaternion (x y z w) from the frame on the parent to tha
                      parent, axes of the frame on the body
 UNIVERSAL  2    2    angles about x, then about y as turned by the first
 PLANAR     3    3    ways along x and y, angle about z
-D6         n    n    any of the ways tx ty tz, then angles about rx ry rz, each as turned by those before it
+D6         n    n    any of the ways tx ty tz, then angles about rx ry rz, each as turned by those before it; or ways and angles
+                     along any axes in any order, each as moved by those before it
 ========== ==== ==== ==========================================================================================
 
 The frame of a joint on its parent and that on its body coincide where q is zero.
@@ -118,9 +119,18 @@ TABLE_1 = {
 }
 
 
+class Combine(enum.IntEnum):
+    """How a coefficient of two materials becomes that of their pair. Where they differ, the higher one rules, as in PhysX."""
+
+    AVERAGE = 0
+    MIN = 1
+    MULTIPLY = 2
+    MAX = 3
+
+
 @dataclass(frozen=True)
 class Material:
-    """Contact material of a shape. The coefficients of a pair are the average of its two materials.
+    """Contact material of a shape. The coefficients of a pair are the average of its two materials, unless one says otherwise.
 
     Args:
         static_friction: mu_s, limit of the friction force while sticking.
@@ -131,6 +141,7 @@ class Material:
         tangent_damping: b_t [N s/m] of the bristles; None as above.
         slip_threshold: v_s [m/s], the speed from which a contact counts as sliding; None takes Table 1.
         restitution: e, normal speed after an impact over that before it (Newton), 0 to 1; averaged like friction.
+        friction_combine, restitution_combine: how they become those of a pair.
     """
 
     static_friction: float = 0.5
@@ -141,6 +152,8 @@ class Material:
     tangent_damping: float | None = None
     slip_threshold: float | None = None
     restitution: float = 0.0
+    friction_combine: Combine = Combine.AVERAGE
+    restitution_combine: Combine = Combine.AVERAGE
 
 
 @dataclass(frozen=True)
@@ -148,6 +161,9 @@ class Drive:
     """What pulls a joint's coordinate: stiffness (target - q) + damping (target_velocity - dq/dt), no more than max_force.
 
     N, m and s, or N m, rad and s. It is implicit: stiff gains are as stable as soft ones.
+
+    acceleration: gains are for each kg or kg m^2 that the coordinate moves in the initial configuration while forces act on no other,
+    1 / (M^-1)_ii; the Model has their products with it, which stay as they are while the scene moves and where masses are set anew.
     """
 
     stiffness: float = 0.0
@@ -155,6 +171,7 @@ class Drive:
     max_force: float = np.inf
     target: float = 0.0
     target_velocity: float = 0.0
+    acceleration: bool = False
 
 
 @dataclass(frozen=True)
@@ -240,11 +257,12 @@ class Model:
     Attributes:
         body_names: name or prim path of each body.
         body_parent: [B] index of the parent body, -1 = world.
-        joint_type: [B] :class:`JointType` of the joint above each body.
+        joint_type: [B] :class:`JointType` of the joint above each body. joint_names: [B] its name, empty where it is none of the scene's.
         joint_pose: [B, 7] frame of that joint in the parent's frame (identity under a FREE or KINEMATIC joint).
         joint_child_pose: [B, 7] frame of that joint in the body's own frame (likewise).
         q_start, v_start: [B] first coordinate of each body in q and v.
         q0: [nq] initial configuration. v0: [nv] initial velocity.
+        dof_names: [nv] joint of each velocity, of several that were made one its own; body, where no joint of the scene carries it.
         dof_body: [nv] body above which each velocity is. dof_kind: [nv] :class:`DofKind`. dof_axis: [nv, 3] in the joint's frame.
         armature: [nv] kg or kg m^2, added to the mass matrix. damping: [nv] N s/m or N m s, force by joint velocity.
         joint_friction: [nv] N or N m, dry friction. limit: [nv, 2] m or rad, least and greatest coordinate, infinite where there is none.
@@ -262,7 +280,8 @@ class Model:
         shape_surface_velocity: [S, 3] m/s in the shape's frame, velocity of the surface relative to the body (belts).
         friction: [S, 2] static and dynamic coefficient.
         contact: [S, 5] k_n, b_n, k_t, b_t, v_s; NaN where the defaults of Table 1 apply.
-        restitution: [S] Newton's e of each material; a pair has the average.
+        restitution: [S] Newton's e of each material; a pair has the average, unless combine says otherwise.
+        combine: [S, 2] :class:`Combine` of friction and of restitution.
         pairs: [P, 2] shapes that may touch, grouped by kind, the lower ShapeType first.
         gravity: [3] m/s^2.
         up_axis: 'Y' or 'Z', for viewers.
@@ -271,6 +290,7 @@ class Model:
 
     body_names: tuple[str, ...]
     body_parent: np.ndarray
+    joint_names: tuple[str, ...]
     joint_type: np.ndarray
     joint_pose: np.ndarray
     joint_child_pose: np.ndarray
@@ -278,6 +298,7 @@ class Model:
     v_start: np.ndarray
     q0: np.ndarray
     v0: np.ndarray
+    dof_names: tuple[str, ...]
     dof_body: np.ndarray
     dof_kind: np.ndarray
     dof_axis: np.ndarray
@@ -300,6 +321,7 @@ class Model:
     friction: np.ndarray
     contact: np.ndarray
     restitution: np.ndarray
+    combine: np.ndarray
     pairs: np.ndarray
     gravity: np.ndarray
     up_axis: str = "Z"

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from .simulator import Simulator
 
 #: What a rollout can record.
+#: What may drive the joints in each step, names of Control's fields.
+CONTROLS = ("position", "velocity", "force")
 FIELDS = ("q", "v", "body_pose", "body_velocity", "status", "iterations", "residual", "residual_energy")
 
 
@@ -62,9 +64,10 @@ class Recorder:
         self.tape = wp.zeros(1, dtype=k.Tape, device=sim.device)
         self.seen_status, self.seen_iterations = (wp.zeros(sim.num_envs, dtype=int, device=sim.device) for _ in range(2))
         # Before any capture: modules cannot be loaded within one.
-        wp.force_load(sim.device, modules=[kernel.module for kernel in (k.apply_wrench, k.record_row, k.add_seen)])
+        kernels = [k.apply_wrench, k.record_row, k.add_seen, *([k.apply_control] if sim.model.articulated else [])]
+        wp.force_load(sim.device, modules=[kernel.module for kernel in kernels])
 
-    def run(self, steps: int, wrench: Any, record: Any, every: int) -> Rollout:
+    def run(self, steps: int, wrench: Any, record: Any, every: int, control: Mapping[str, Any] | None) -> Rollout:
         """See Simulator.rollout."""
         sim, k = self.sim, self.kernels
         steps, every = whole_number("rollout: steps", steps, 1), whole_number("rollout: every", every, 1)
@@ -76,7 +79,8 @@ class Recorder:
         for name in names:
             if name not in FIELDS:
                 raise WarpLcpError(f"rollout: record holds {name!r}; choose from {', '.join(FIELDS)}")
-        source = None if wrench is None else self._wrench(wrench, steps)
+        sources = {} if wrench is None else {"wrench": self._source("wrench", wrench, steps, sim.model.num_bodies, sim._types.spatial)}
+        sources |= self._controls(control, steps)
 
         rows = steps // every
         arrays = {name: self._empty(name, rows) for name in dict.fromkeys(names)}
@@ -84,13 +88,15 @@ class Recorder:
         tape.every = every
         for name, array in arrays.items():
             setattr(tape, name, array)
-        if source is not None:
-            tape.wrench = source
+        for name, array in sources.items():
+            setattr(tape, name, array)
         self.tape.assign(wp.array([tape], dtype=k.Tape, device="cpu"))
         for zeroed in (self.step, self.seen_status, self.seen_iterations, sim.status, sim.iterations):
             zeroed.zero_()
 
-        graph = sim._captured("rollout", self._step) if source is None else sim._captured("pushed rollout", self._pushed_step)
+        before: list[Callable[[], None]] = [self._push] if wrench is not None else []
+        before += [self._drive] if control else []
+        graph = sim._captured(" ".join(["rollout", *(f.__name__ for f in before)]), lambda: self._step(before))
         for _ in range(steps):
             wp.capture_launch(graph)
         wp.launch(
@@ -100,12 +106,18 @@ class Recorder:
         sim._finish(steps)
         return Rollout(time, **arrays)
 
-    def _pushed_step(self) -> None:
+    def _push(self) -> None:
         self.sim.launch(self.kernels.apply_wrench, [self.tape, self.step, self.sim.wrench], self.sim.model.num_bodies)
-        self._step()
 
-    def _step(self) -> None:
+    def _drive(self) -> None:
+        control: Any = self.sim.control
+        inputs = [self.tape, self.step, control.position, control.velocity, control.force]
+        self.sim.launch(self.kernels.apply_control, inputs, self.sim.model.nv)
+
+    def _step(self, before: list[Callable[[], None]]) -> None:
         sim = self.sim
+        for launch in before:
+            launch()
         sim._step_kernels()
         state = [sim.q, sim.v, sim.bodies, sim.status, sim.iterations, sim.residual, sim.residual_energy]
         seen = [self.seen_status, self.seen_iterations]
@@ -118,22 +130,31 @@ class Recorder:
         shape = (rows, sim.num_envs, widths[name]) if name in widths else (rows, sim.num_envs)
         return wp.empty(shape, dtype=kinds.get(name, sim.real), device=sim.device)
 
-    def _wrench(self, wrench: Any, steps: int) -> wp.array:
-        """Wrenches of all steps on the device: [steps, 1|E, B] spatial vectors."""
-        sim, spatial = self.sim, self.sim._types.spatial
-        e, b = sim.num_envs, sim.model.num_bodies
-        allowed = [(steps, e, b), (steps, 1, b)]
-        if isinstance(wrench, wp.array):
-            if wrench.dtype is not spatial or wrench.shape not in allowed or wrench.device != sim.device:
+    def _controls(self, control: Mapping[str, Any] | None, steps: int) -> dict[str, wp.array]:
+        """Targets and forces of all steps on the device, by Control's fields."""
+        if not control:
+            return {}
+        if not isinstance(control, Mapping) or not set(control) <= set(CONTROLS):
+            raise WarpLcpError(f"rollout: control is {control!r:.60}; give a dict with some of {', '.join(CONTROLS)}")
+        if self.sim.control is None:
+            raise WarpLcpError("rollout: control drives joints, and the model has none; give wrench")
+        return {name: self._source(name, value, steps, self.sim.model.nv, self.sim.real) for name, value in control.items()}
+
+    def _source(self, name: str, value: Any, steps: int, width: int, dtype: Any) -> wp.array:
+        """What is applied in all steps, on the device: [steps, 1|E, width]."""
+        sim, inner = self.sim, (6,) if name == "wrench" else ()
+        allowed = [(steps, sim.num_envs, width), (steps, 1, width)]
+        if isinstance(value, wp.array):
+            if value.dtype is not dtype or value.shape not in allowed or value.device != sim.device:
                 raise WarpLcpError(
-                    f"rollout: wrench is {wrench.shape} of {wrench.dtype.__name__} on {wrench.device}; "
-                    f"give {allowed[0]} or {allowed[1]} of {spatial.__name__} on {sim.device}"
+                    f"rollout: {name} is {value.shape} of {value.dtype.__name__} on {value.device}; "
+                    f"give {allowed[0]} or {allowed[1]} of {dtype.__name__} on {sim.device}"
                 )
-            return wrench
+            return value
         try:
-            values = np.asarray(wrench, dtype=float)
+            values = np.asarray(value, dtype=float)
         except (TypeError, ValueError) as error:
-            raise WarpLcpError(f"rollout: wrench is no array of numbers: {error}") from error
-        if values.shape not in [(*shape, 6) for shape in allowed]:
-            raise WarpLcpError(f"rollout: wrench has shape {values.shape}; give {(*allowed[0], 6)} or {(*allowed[1], 6)}")
-        return sim._constant(values, spatial)
+            raise WarpLcpError(f"rollout: {name} is no array of numbers: {error}") from error
+        if values.shape not in [(*shape, *inner) for shape in allowed]:
+            raise WarpLcpError(f"rollout: {name} has shape {values.shape}; give {(*allowed[0], *inner)} or {(*allowed[1], *inner)}")
+        return sim._constant(values, dtype)

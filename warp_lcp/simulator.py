@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import enum
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -216,11 +216,18 @@ class Simulator:
             wp.capture_launch(graph)
         self._finish(count)
 
-    def rollout(self, steps: int, wrench: Any = None, record: Sequence[str] = ("q", "v", "status"), every: int = 1) -> Rollout:
+    def rollout(
+        self,
+        steps: int,
+        wrench: Any = None,
+        record: Sequence[str] = ("q", "v", "status"),
+        every: int = 1,
+        control: Mapping[str, Any] | None = None,
+    ) -> Rollout:
         """Advance every environment by ``steps`` steps and record them on the device, without waiting for it.
 
-        The same bits as as many step() calls, each after writing its wrench into :attr:`wrench`, where the last one
-        stays. The step is captured once for all rollouts; arrays are new each time. Status and iterations of the
+        The same bits as as many step() calls, each after writing its wrench into :attr:`wrench` and its controls into :attr:`control`,
+        where the last ones stay. The step is captured once for all rollouts; arrays are new each time. Status and iterations of the
         simulator are afterwards those of all steps, as after step(steps).
 
         Args:
@@ -230,6 +237,8 @@ class Simulator:
                 device, or numbers [..., 6]; force [N] and torque [N m] at the centre of mass, world axes.
             record: what to record, names of :class:`Rollout`'s fields (or one name alone).
             every: steps to a row, at least 1; steps // every rows. What is left over is stepped, not recorded.
+            control: None: what :attr:`control` holds, throughout. Or a dict with some of "position", "velocity" and "force", each for
+                every step, [steps, num_envs, nv] or [steps, 1, nv], an array as for ``wrench``; what is not in it stays.
 
         Raises:
             WarpLcpError: for an argument outside its range.
@@ -237,7 +246,7 @@ class Simulator:
         """
         if self._recorder is None:
             self._recorder = Recorder(self)
-        return self._recorder.run(steps, wrench, record, every)
+        return self._recorder.run(steps, wrench, record, every, control)
 
     def _finish(self, count: int) -> None:
         self.time += count * self.dt
@@ -307,7 +316,13 @@ class Simulator:
             if present is None or present.shape != (rows[name], pairs):
                 setattr(p, name, wp.empty((rows[name], pairs), dtype=dtype, device=self.device))
                 self._graphs.clear()
-        wp.launch(self._kernels.combine_pairs, dim=(max(rows.values()), pairs), inputs=[self.topology, p], device=self.device)
+        inputs = [self.topology, p, self._combine(0)]
+        wp.launch(self._kernels.combine_pairs, dim=(max(rows.values()), pairs), inputs=inputs, device=self.device)
+
+    def _combine(self, which: int) -> wp.array:
+        """[P] how the friction (0) or restitution (1) of a pair's two materials becomes one; none where all take the mean."""
+        modes = self.model.combine[self.model.pairs, which].max(axis=1, initial=0)
+        return self.ints(modes if modes.any() else [])
 
     def _set_constant(self, bundle: Any, name: str, value: np.ndarray) -> None:
         present = getattr(bundle, name)
@@ -325,7 +340,7 @@ class Simulator:
             k = restitution.make(self.real)
             self._kernels.bounce, self._kernels.judge, self._kernels.settle = k.bounce, k.judge, k.settle
             bounces = self.bounces = k.Bounces()
-            bounces.coefficient = self._constant(value, self.real)
+            bounces.coefficient, bounces.combine = self._constant(value, self.real), self._combine(1)
             bounces.kick, bounces.before = (
                 self._array(self.model.max_contacts, self.real),
                 self._array(self.model.max_contacts, self._types.vec3),

@@ -17,6 +17,9 @@ Decisions where USD leaves room:
   ``normalDamping``, ``tangentStiffness``, ``tangentDamping`` in mass/time^2 and mass/time, ``slipThreshold`` in
   distance/time) and the velocity of a belt from the collider (``warpLcp:surfaceVelocity``, distance/time along the
   collider prim's axes), all in stage units.
+- So are ``physxMaterial:frictionCombineMode`` and ``restitutionCombineMode`` (average, min, multiply, max; of two that
+  differ the later one rules), and ``newton:selfCollisionEnabled`` or ``physxArticulation:enabledSelfCollisions`` = false
+  of an articulation root, whose bodies then pass through each other.
 """
 
 from __future__ import annotations
@@ -38,9 +41,9 @@ import numpy as np
 from . import hulls
 from .builder import ModelBuilder, capsule_solid, rotation_matrix
 from .errors import MissingExtra, ModelError, SceneError
-from .model import Ignored, JointType, Material, Model, Report, ShapeType
-from .usd_attributes import CONTACT_ATTRIBUTES, SURFACE_VELOCITY, unread, written
-from .usd_joints import JointReader
+from .model import Combine, Ignored, JointType, Material, Model, Report, ShapeType
+from .usd_attributes import COMBINE_ATTRIBUTES, CONTACT_ATTRIBUTES, SELF_COLLISION, SURFACE_VELOCITY, unread, written
+from .usd_joints import JointReader, some
 from .usd_shapes import Solid, mesh_solid, round_solid
 
 _UNIFORM = 1e-4  # relative: scales closer than this are equal, axes closer than this are perpendicular
@@ -301,7 +304,7 @@ class _Reader:
         self._filter()
         self._other_prims()
         if self.unbound:
-            self.notes.append(f"no physics material on {_some(self.unbound)}: friction 0.5 / 0.5, no restitution")
+            self.notes.append(f"no physics material on {some(self.unbound)}: friction 0.5 / 0.5, no restitution")
         self._diagnostics(delegate)
         gx, gy, gz = self.builder.gravity.tolist()
         return SceneReading(
@@ -717,13 +720,22 @@ class _Reader:
             self.notes.append(f"{path}: dynamicFriction {dynamic:g} exceeds staticFriction {static:g}: {dynamic:g} is taken for both")
         bounce = written(api.GetRestitutionAttr().Get())
         material = Material(static_friction=max(static, dynamic), dynamic_friction=dynamic, restitution=bounce)
+        values: dict[str, Any] = {}
+        for name, field in COMBINE_ATTRIBUTES.items():
+            attribute = prim.GetAttribute(name)
+            mode = str(attribute.Get()) if attribute and attribute.HasAuthoredValue() else "average"
+            if mode.upper() in Combine.__members__:
+                values[field] = Combine[mode.upper()]
+            else:
+                why = f"{mode} is none of average, min, multiply, max: average is taken"
+                self._repeat(path, name, why)
         for name, field in CONTACT_ATTRIBUTES.items():
             attribute = prim.GetAttribute(name)
             if attribute and attribute.Get() is not None:
                 self.read_attributes.add(attribute.GetPath())
                 unit = self.length if field == "slip_threshold" else self.mass_unit
-                material = replace(material, **{field: unit * written(attribute.Get())})
-        return material
+                values[field] = unit * written(attribute.Get())
+        return replace(material, **values)
 
     # -- pairs ------------------------------------------------------------------------------------------------------
 
@@ -740,6 +752,21 @@ class _Reader:
         for path, desc in (x for kind in kinds for x in self._descs(kind)):
             for target in desc.filteredCollisions:
                 self._filter_all(self._shapes_of(path), self._shapes_of(target))
+
+        for path, desc in self._descs("Articulation"):
+            if not self._touches_itself(path):
+                own = [s.index for s in self.shapes if s.body and s.body in set(desc.articulatedBodies)]
+                self._filter_all(own, own)
+
+    def _touches_itself(self, root: Any) -> bool:
+        """Whether the bodies of an articulation touch each other; the first attribute that is authored rules."""
+        prim, answer = self.stage.GetPrimAtPath(root), True
+        for name in reversed(SELF_COLLISION):
+            attribute = prim.GetAttribute(name)
+            if attribute and attribute.HasAuthoredValue():
+                self.read_attributes.add(attribute.GetPath())
+                answer = bool(attribute.Get())
+        return answer
 
     def _groups_apart(self) -> set[frozenset[Any]]:
         """Pairs of collision groups that do not collide (one group: its members among themselves).
@@ -844,7 +871,3 @@ class _Reader:
 
 def _decimals(values: Any) -> np.ndarray:
     return np.array([written(v) for v in values])
-
-
-def _some(paths: list[str]) -> str:
-    return ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")

@@ -15,6 +15,11 @@ CONTACT_ATTRIBUTES = {
     "warpLcp:tangentDamping": "tangent_damping",
     "warpLcp:slipThreshold": "slip_threshold",
 }
+COMBINE_ATTRIBUTES = {
+    "physxMaterial:frictionCombineMode": "friction_combine",
+    "physxMaterial:restitutionCombineMode": "restitution_combine",
+}
+SELF_COLLISION = ("newton:selfCollisionEnabled", "physxArticulation:enabledSelfCollisions")
 SURFACE_VELOCITY = "warpLcp:surfaceVelocity"
 
 #: Attributes of other engines that change the motion: family -> names (None: all), with the value that has no effect.
@@ -35,7 +40,7 @@ VENDOR_ATTRIBUTES: dict[str, dict[str, Any] | None] = {
     "physxArticulation": {"enabledSelfCollisions": True},
     "physxParticle": None,
     "physxDeformable": None,
-    "physxMaterial": {"frictionCombineMode": "average", "compliantContactStiffness": 0.0, "compliantContactDamping": 0.0},
+    "physxMaterial": {"compliantContactStiffness": 0.0, "compliantContactDamping": 0.0},
     "physxCollision": {"restOffset": 0.0},
     "newton": {
         "contactStiffness": 0.0,
@@ -51,8 +56,20 @@ VENDOR_ATTRIBUTES: dict[str, dict[str, Any] | None] = {
         "selfCollisionEnabled": True,
         "jointsAddMobility": False,
     },
-    "mjc": {"solref": None, "solimp": None, "condim": 3, "priority": 0, "solmix": 1.0, "gravcomp": 0.0, "margin": 0.0, "inertia": ""},
+    "mjc": {
+        "stiffness": 0.0,
+        "solref": None,
+        "solimp": None,
+        "condim": 3,
+        "priority": 0,
+        "solmix": 1.0,
+        "gravcomp": 0.0,
+        "margin": 0.0,
+        "inertia": "",
+    },
 }
+#: Applied schemas that couple joints: beginnings of their names, which need not be registered.
+COUPLINGS = ("NewtonMimicAPI", "PhysxMimicJointAPI", "MjcEquality")
 VENDOR_NAMES = {"physx": "PhysX", "newton": "Newton", "mjc": "MuJoCo"}
 
 
@@ -71,8 +88,12 @@ def unread(prim: Any, read: set[Any]) -> list[tuple[str, str]]:
             stray = name.count(":") == 1 and name not in defined and not isinstance(attribute.Get(), str)
             if stray and not _neutral(attribute.Get()):
                 families.setdefault("physics", []).append(name)
-        elif _changes_motion(name, attribute):
+        elif attribute.GetPath() not in read and _changes_motion(name, attribute):
             families.setdefault(family, []).append(name)
+    schemas = prim.GetMetadata("apiSchemas")
+    for schema in schemas.GetAppliedItems() if schemas else ():
+        if schema.startswith(COUPLINGS):
+            entries.append((schema, "joints that follow others are not supported yet: the joint moves by itself"))
     for family, names in families.items():
         if family == "physics":
             why = "no schema applied to this prim has it, so USD does not read it; apply PhysicsMassAPI, PhysicsRigidBodyAPI, ..."

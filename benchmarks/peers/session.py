@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..robots import Robot
+from ..robots import Robot, of_scene
 from ..scenes import Scene
 from . import Peer
 
@@ -112,8 +112,11 @@ class Session:
 
     def make(self, variant: str, scene: Scene | Robot, every: int = 1) -> Task:
         """Let the peer simulate a scene once, not timed, with a sample after every so many steps."""
-        if scene.made is not None:
-            raise Refused(f"{self.peer.name}, {scene.name}: joints, belts or two coefficients of friction, which adapters are not told")
+        if isinstance(scene, Scene) and scene.made is not None:
+            try:
+                scene = of_scene(scene)
+            except ValueError as why:
+                raise Refused(f"{self.peer.name}, {why}") from why
         index = next(self.ids)
         state, result = self.work / f"state{index}.npz", self.work / f"result{index}.npz"
         scene.save(state)

@@ -58,10 +58,13 @@ def model(job: Job) -> str:
             for body in children.get(parent, [])
         )
 
-    options = " ".join(f'{key}="{job.settings[key]}"' for key in OPTIONS if key in job.settings)
+    drives = actuators(job.tree)
+    # Actuators' damping is implicit with this rule alone, joints' with Euler's, MuJoCo's default, too.
+    rule = {"integrator": "implicitfast"} if drives else {}
+    options = " ".join(f'{key}="{value}"' for key, value in (rule | {k: job.settings[k] for k in OPTIONS if k in job.settings}).items())
     return (
         f'<mujoco><compiler angle="radian"/><option timestep="{job.dt}" gravity="{numbers(job.gravity)}" {options}>'
-        f'<flag filterparent="disable"/></option><worldbody>{geoms[-1]}{nested(-1)}</worldbody>{excluded(job)}</mujoco>'
+        f'<flag filterparent="disable"/></option><worldbody>{geoms[-1]}{nested(-1)}</worldbody>{excluded(job)}{drives}</mujoco>'
     )
 
 
@@ -88,7 +91,7 @@ def inertial(job: Job, body: int) -> str:
 
 
 def joints(tree: Tree | None, body: int) -> str:
-    """The joint above a body: one of MuJoCo's for each of its coordinates. Drives of unlimited force are springs and dampers."""
+    """The joint above a body: one of MuJoCo's for each of its coordinates. Drives are springs and dampers, or actuators."""
     if tree is None or tree.joint_type[body] == FREE:
         return "<freejoint/>"
     if tree.joint_type[body] == KINEMATIC:
@@ -97,14 +100,12 @@ def joints(tree: Tree | None, body: int) -> str:
     for i in np.flatnonzero(tree.dof_body == body):
         if tree.dof_kind[i] == BALL_ON:
             continue
-        stiffness, damping, force, target, target_velocity = tree.drive[i].tolist()
-        if (stiffness or damping) and (np.isfinite(force) or target_velocity):
-            raise Refused("drives of limited force or with a target velocity are not written")
+        stiffness, damping, _, target, _ = tree.drive[i].tolist() if is_spring(tree.drive[i]) else (0.0, 0.0, 0.0, 0.0, 0.0)
         kind = "ball" if tree.joint_type[body] == SPHERICAL else "slide" if tree.dof_kind[i] == LINEAR else "hinge"
         if kind == "ball" and any(np.ptp(values[i : i + 3]) for values in (tree.armature, tree.damping, tree.joint_friction)):
             raise Refused("a ball has one armature, damping and friction for all its axes")
         values = {"armature": tree.armature[i], "damping": tree.damping[i] + damping, "frictionloss": tree.joint_friction[i]}
-        found += f'<joint type="{kind}" pos="{numbers(frame[:3])}" '
+        found += f'<joint name="j{i}" type="{kind}" pos="{numbers(frame[:3])}" '
         if kind != "ball":
             values |= {"stiffness": stiffness, "springref": target}
             found += f'axis="{numbers(rotate(frame[3:], tree.dof_axis[i]))}" '
@@ -113,6 +114,23 @@ def joints(tree: Tree | None, body: int) -> str:
                 found += f'limited="true" range="{numbers(ends)}" '  # of some width: MuJoCo takes no other
         found += " ".join(f'{name}="{float(value)!r}"' for name, value in values.items()) + "/>"
     return found
+
+
+def is_spring(drive: np.ndarray) -> bool:
+    """Is a drive (stiffness, damping, force, target, target velocity) a spring and a damper, to be had with the joint?"""
+    return bool(np.isinf(drive[2]) and not drive[4])
+
+
+def actuators(tree: Tree | None) -> str:
+    """Drives of limited force, or with a target velocity: of a constant, the coordinate and its rate; none reads a control."""
+    lines = ""
+    for i, drive in enumerate([] if tree is None else tree.drive):
+        stiffness, damping, force, target, target_velocity = drive.tolist()
+        if (stiffness or damping) and not is_spring(drive):
+            limited = f'forcelimited="true" forcerange="{-force!r} {force!r}"' if np.isfinite(force) else ""
+            bias = numbers(np.array([stiffness * target + damping * target_velocity, -stiffness, -damping]))
+            lines += f'<general joint="j{i}" gaintype="fixed" gainprm="0" biastype="affine" biasprm="{bias}" {limited}/>'
+    return f"<actuator>{lines}</actuator>" if lines else ""
 
 
 def excluded(job: Job) -> str:
