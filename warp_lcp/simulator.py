@@ -475,6 +475,8 @@ class Simulator:
         if not self._methods[0].makes_rows:
             lanes = 1 if self.device.is_cpu else self.model.max_contacts
             self.launch(k.contact_rows, [*scene, self.mechanics, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
+            if self.model.articulated and self.model.bodies_meet:
+                self.launch(k.calm_overlaps, [self.mechanics, self.rows, lanes], lanes)
         if self.model.articulated and len(self.mechanics.row_kind):
             self.launch(k.joint_rows, [self.mechanics, self.bodies, self.q, self.v, h, self.rows])
         if self.bounces is not None:
@@ -701,6 +703,8 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         stages.bounds = collide.pair_functions(real).bounds
     if not without_rows:
         stages.contact_rows = rows.contact_rows
+        if model.articulated and model.bodies_meet:
+            stages.calm_overlaps = rows.calm_overlaps
     if model.bounces:
         rebound = restitution.make(real)
         stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
