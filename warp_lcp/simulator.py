@@ -386,7 +386,7 @@ class Simulator:
                 moments[..., 2] <= (moments[..., 0] + moments[..., 1]) * (1 + 1e-6)
             )
             possible &= np.isclose(array, np.swapaxes(array, -1, -2), rtol=1e-6, atol=0.0).all(axis=(-1, -2))
-            allowed &= possible[..., None, None]
+            allowed &= (possible | (self.model.mass == 0.0))[..., None, None]
         if not allowed.all():
             where = tuple(int(i) for i in np.argwhere(~allowed)[0])
             raise WarpLcpError(f"set_parameters: {name}{list(where)} is {array[where]}; {PARAMETERS[name]}")
