@@ -57,7 +57,7 @@ def scenes() -> list[wl.Model]:
     joints.add_box(joints.add_body(), (0.1, 0.1, 0.1))
     link = joints.add_body(pose=(0.5, 0, 0, 0, 0, 0, 1))
     joints.add_box(link, (0.1, 0.1, 0.1))
-    joints.add_joint(wl.JointType.REVOLUTE, 0, link, limit=(-1.0, 1.0))
+    joints.add_joint(wl.JointType.REVOLUTE, 0, link, limit=(-1.0, 1.0), collide=True)
     joints.add_joint(wl.JointType.SPHERICAL, -1, link, loop=True)
     return [*made, many.finalize(), joints.finalize()]
 

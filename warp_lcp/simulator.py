@@ -386,7 +386,7 @@ class Simulator:
                 moments[..., 2] <= (moments[..., 0] + moments[..., 1]) * (1 + 1e-6)
             )
             possible &= np.isclose(array, np.swapaxes(array, -1, -2), rtol=1e-6, atol=0.0).all(axis=(-1, -2))
-            allowed &= possible[..., None, None]
+            allowed &= (possible | (self.model.mass == 0.0))[..., None, None]
         if not allowed.all():
             where = tuple(int(i) for i in np.argwhere(~allowed)[0])
             raise WarpLcpError(f"set_parameters: {name}{list(where)} is {array[where]}; {PARAMETERS[name]}")
@@ -475,6 +475,8 @@ class Simulator:
         if not self._methods[0].makes_rows:
             lanes = 1 if self.device.is_cpu else self.model.max_contacts
             self.launch(k.contact_rows, [*scene, self.mechanics, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
+            if self.model.articulated and self.model.bodies_meet:
+                self.launch(k.calm_overlaps, [self.mechanics, self.rows, lanes], lanes)
         if self.model.articulated and len(self.mechanics.row_kind):
             self.launch(k.joint_rows, [self.mechanics, self.bodies, self.q, self.v, h, self.rows])
         if self.bounces is not None:
@@ -701,6 +703,8 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         stages.bounds = collide.pair_functions(real).bounds
     if not without_rows:
         stages.contact_rows = rows.contact_rows
+        if model.articulated and model.bodies_meet:
+            stages.calm_overlaps = rows.calm_overlaps
     if model.bounces:
         rebound = restitution.make(real)
         stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
