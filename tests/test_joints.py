@@ -670,7 +670,7 @@ def quadruped(thigh: float = 0.6, knee: float = -1.2) -> wl.ModelBuilder:
     base = builder.add_body("base", pose=(0, 0, height, 0, 0, 0, 1), mass=6.0)
     builder.add_box(base, (0.2, 0.1, 0.05), material=rubber)
     drive = Drive(200.0, 5.0, 60.0)
-    for x, y in ((0.2, 0.12), (0.2, -0.12), (-0.2, 0.12), (-0.2, -0.12)):
+    for x, y in ((0.2, 0.125), (0.2, -0.125), (-0.2, 0.125), (-0.2, -0.125)):  # thighs 5 mm beside the base
         hip = np.array([x, y, height])
         turns = [joints.about(1, 0.0), joints.about(1, thigh), joints.about(1, thigh + knee)]
         down = [joints.rotate(turn, np.array([0, 0, -1.0])) for turn in turns]
