@@ -28,7 +28,7 @@ FADING = wp.constant(4.0)
 def pair_functions(real) -> SimpleNamespace:
     """Functions that every pair kernel uses."""
     t = scalar_types(real)
-    vec3, vec4, quat, transform = t.vec3, t.vec4, t.quat, t.transform
+    vec3, vec4, quat, transform, spatial = t.vec3, t.vec4, t.quat, t.transform, t.spatial
     Bodies, Slots, Topology = t.Bodies, t.Slots, t.Topology
 
     @wp.func
@@ -118,6 +118,17 @@ def pair_functions(real) -> SimpleNamespace:
         return turn
 
     @wp.func
+    def shape_motion(topology: Topology, bodies: Bodies, env: int, shape: int):
+        """Centre of mass and velocity of the body that a shape is on, zero for the world's."""
+        com = vec3()
+        twist = spatial()
+        body = topology.shape_body[shape]
+        if body >= 0:
+            com = bodies.com[env, body]
+            twist = bodies.velocity[env, body]
+        return com, twist
+
+    @wp.func
     def rotation(turn: vec3) -> quat:
         """By this vector, but for its third power / 12; exactly none by zero."""
         half = real(0.5) * turn
@@ -189,6 +200,7 @@ def pair_functions(real) -> SimpleNamespace:
         set_apart=set_apart,
         shape_velocity=shape_velocity,
         shape_turn=shape_turn,
+        shape_motion=shape_motion,
         rotation=rotation,
         shift=shift,
         outside_box=outside_box,

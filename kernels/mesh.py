@@ -28,10 +28,11 @@ SAME = wp.constant(1.0e-6)
 def make(real) -> SimpleNamespace:
     """Kernels ``sharp_on_mesh`` and ``round_on_mesh``; launch with dim (E, pairs of a kind)."""
     t = scalar_types(real)
-    vec3, transform, spatial = t.vec3, t.transform, t.spatial
+    vec3, transform = t.vec3, t.transform
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, a, Hulls = pair_functions(real), axes(real), functions(real).Hulls
     shape_pose, reach, shape_velocity, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write_bent
+    shape_motion = f.shape_motion
     far_apart, set_apart, inverse_mass, touching_depth = f.far_apart, f.set_apart, a.inverse_mass, a.touching_depth
     meet_sharp, meet_round = convex.meeting(real), rounded.meeting(real)
 
@@ -215,18 +216,8 @@ def make(real) -> SimpleNamespace:
             centre = wp.transform_get_translation(xa)
             near = size[0] + reach(topology, bodies, env, sa, centre, size[0] + half, h)
             near += reach(topology, bodies, env, sb, centre, size[0] + half, h)
-            com_a = vec3()
-            com_b = vec3()
-            twist_a = spatial()
-            twist_b = spatial()
-            body_a = topology.shape_body[sa]
-            body_b = topology.shape_body[sb]
-            if body_a >= 0:
-                com_a = bodies.com[env, body_a]
-                twist_a = bodies.velocity[env, body_a]
-            if body_b >= 0:
-                com_b = bodies.com[env, body_b]
-                twist_b = bodies.velocity[env, body_b]
+            com_a, twist_a = shape_motion(topology, bodies, env, sa)
+            com_b, twist_b = shape_motion(topology, bodies, env, sb)
             normals = wp.zeros(shape=(MOST,), dtype=vec3)
             at = wp.zeros(shape=(MOST,), dtype=vec3)
             gaps = wp.zeros(shape=(MOST,), dtype=real)

@@ -343,10 +343,11 @@ def meeting(real):
 def make(real):
     """Kernel ``rounded``; launch with dim (E, pairs of a kind)."""
     t = scalar_types(real)
-    vec3, spatial = t.vec3, t.spatial
+    vec3 = t.vec3
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, Hulls, meet = pair_functions(real), functions(real).Hulls, meeting(real)
-    shape_pose, reach, write_bent, far_apart, set_apart = f.shape_pose, f.reach, f.write_bent, f.far_apart, f.set_apart
+    shape_pose, shape_motion, reach = f.shape_pose, f.shape_motion, f.reach
+    write_bent, far_apart, set_apart = f.write_bent, f.far_apart, f.set_apart
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def rounded(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int):
@@ -369,18 +370,8 @@ def make(real):
             xb = shape_pose(topology, bodies, env, sb)
             near = size_a[0] + reach(topology, bodies, env, sa, wp.transform_get_translation(xa), size_a[0] + half, h)
             near += reach(topology, bodies, env, sb, wp.transform_get_translation(xb), wp.length(size_b), h)
-            com_a = vec3()
-            com_b = vec3()
-            twist_a = spatial()
-            twist_b = spatial()
-            body_a = topology.shape_body[sa]
-            body_b = topology.shape_body[sb]
-            if body_a >= 0:
-                com_a = bodies.com[env, body_a]
-                twist_a = bodies.velocity[env, body_a]
-            if body_b >= 0:
-                com_b = bodies.com[env, body_b]
-                twist_b = bodies.velocity[env, body_b]
+            com_a, twist_a = shape_motion(topology, bodies, env, sa)
+            com_b, twist_b = shape_motion(topology, bodies, env, sb)
             normals = wp.zeros(shape=(3,), dtype=vec3)
             at = wp.zeros(shape=(3,), dtype=vec3)
             gaps = wp.zeros(shape=(3,), dtype=real)
