@@ -7,9 +7,8 @@ h sigma_up. v and h lambda_t are eliminated: with W = J M^-1 J^T + epsilon, b = 
     h lambda_t = A^-1 (E (w_up - w_lo) - W_tn h lambda_n - b_t).
 
 Contacts without friction have the one unknown h lambda_n and no rows in A. Joints that close loops have no unknown: all three of their rows
-are bilateral (eq. 14) and are eliminated with the tangents, t above being all eliminated rows. Frozen
-limits (box and hybrid laws) are numbers in q
-instead of entries mu.
+are bilateral (eq. 14) and are eliminated with the tangents, t above being all eliminated rows. Frozen limits
+(box and hybrid laws) are numbers in q instead of entries mu.
 
 Anitescu and Potra (ref. 6) have generators instead: h lambda_t = D beta with the 2 k directions +-e_j, and
 

@@ -38,12 +38,12 @@ from typing import Any
 
 import numpy as np
 
-from . import hulls
-from .builder import ModelBuilder, capsule_solid, rotation_matrix
+from .builder import ModelBuilder
 from .errors import MissingExtra, ModelError, SceneError
 from .model import Combine, Ignored, JointType, Material, Model, Report, ShapeType
-from .usd_attributes import COMBINE_ATTRIBUTES, CONTACT_ATTRIBUTES, SELF_COLLISION, SURFACE_VELOCITY, unread, written
+from .usd_attributes import COMBINE_ATTRIBUTES, CONTACT_ATTRIBUTES, SELF_COLLISION, SURFACE_VELOCITY, decimals, unread, written
 from .usd_joints import JointReader, some
+from .usd_mass import MassReader, Unusable
 from .usd_shapes import Solid, mesh_solid, round_solid
 
 _UNIFORM = 1e-4  # relative: scales closer than this are equal, axes closer than this are perpendicular
@@ -206,10 +206,6 @@ def _refusal(reading: SceneReading) -> str:
     left = len(reading.report.unsupported) - _LISTED
     more = f"; and {left} more (warp-lcp info lists them)" if left > 0 else ""
     return f"{reading.source}: cannot be simulated: " + "; ".join(f"{w} {', '.join(p)}: {why}" for (w, why), p in groups.items()) + more
-
-
-class _Unusable(Exception):
-    """A body whose mass cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -401,18 +397,18 @@ class _Reader:
             self._repeat(path, "physics:startsAsleep", "bodies never sleep here")
         if desc.kinematicBody and self._animated(path):
             self.ignored.append(Ignored(str(path), "animated pose", "a kinematic body keeps its authored velocities"))
-        velocity = self.length * frame.sign * frame.rotation @ _decimals(desc.linearVelocity)
-        angular = np.radians(frame.rotation @ _decimals(desc.angularVelocity))
+        velocity = self.length * frame.sign * frame.rotation @ decimals(desc.linearVelocity)
+        angular = np.radians(frame.rotation @ decimals(desc.angularVelocity))
         options = {"pose": self._pose(frame), "velocity": velocity, "angular_velocity": angular}
         try:
             if desc.kinematicBody:
                 options["joint"] = JointType.KINEMATIC
             else:
-                mass = self._mass(path, frame)
+                mass = MassReader(self).of(path, frame)
                 self.masses.append(0.0 if path in self.massless else mass["mass"])
                 options.update(mass)
             index = self.builder.add_body(str(path), **options)
-        except (_Unusable, ModelError) as error:
+        except (Unusable, ModelError) as error:
             self.unsupported.append(Ignored(str(path), "rigid body", str(error).removeprefix(f"{path}: ")))
             self.masses.append(None)
         else:
@@ -434,137 +430,6 @@ class _Reader:
                 return True
             prim = prim.GetParent()
         return False
-
-    def _mass(self, path: Any, frame: _Frame) -> dict[str, Any]:
-        """Mass [kg], centre of mass [m, body frame] and inertia [kg m^2, body axes]; None where unknown.
-
-        USD's own precedence rules, by ComputeMassProperties. What is authored on the body itself is taken from there:
-        the function takes any inertia under 1e-5 for unauthored and works in single precision.
-        """
-        prim = self.stage.GetPrimAtPath(path)
-        own = [p for p, d in self.colliders.items() if d.rigidBody == path and d.collisionEnabled]
-        for p in (path, *own):
-            self._check_authored(p)
-        unknown: list[Any] = []
-        found, diagonal, com, axes = self.px.UsdPhysics.RigidBodyAPI(prim).ComputeMassProperties(
-            lambda collider: self._unit_mass(collider, frame, unknown)
-        )
-        authored = self._authored_mass(prim)
-        mass = authored["mass"] or found
-        if not unknown and not mass > 0.0:
-            self.massless.append(path)
-            return {"mass": None}
-        if not own and authored["diagonal"] is None:
-            self.notes.append(f"{path}: no collider and no physics:diagonalInertia: the inertia of a sphere of 0.1 m radius, as in USD")
-        elif authored["zero"]:
-            self.notes.append(f"{path}: physics:mass = 0 means 'not authored' in USD: its mass follows from its colliders")
-        if authored["diagonal"] is not None:
-            diagonal, axes = authored["diagonal"], authored["axes"]
-        if authored["com"] is not None:
-            com = frame.rotation.T @ frame.linear @ authored["com"]
-        if unknown and not authored["mass"]:
-            return {"mass": None}
-        values: dict[str, Any] = {"mass": self.mass_unit * mass}
-        if len(own) == 1 and not self.stage.GetPrimAtPath(own[0]).HasAPI(self.px.UsdPhysics.MassAPI):
-            unknown = own  # whatever its density: the builder finds centre and inertia in double precision
-        if not unknown or authored["com"] is not None:
-            values["com"] = self.length * np.array(com, dtype=float)
-        if not unknown or authored["diagonal"] is not None:
-            turn = self._principal_axes(axes)
-            inertia = self.mass_unit * self.length**2 * turn @ np.diag(np.array(diagonal, dtype=float)) @ turn.T
-            values["inertia"] = 0.5 * (inertia + inertia.T)
-        return values
-
-    def _principal_axes(self, quat: Any) -> np.ndarray:
-        """Rotation matrix; the identity where the quaternion is unauthored (zero) or was never set."""
-        xyzw = np.array([*quat.GetImaginary(), quat.GetReal()], dtype=float)
-        norm = np.linalg.norm(xyzw)
-        return rotation_matrix(xyzw / norm) if abs(norm - 1.0) < 1e-3 else np.eye(3)
-
-    def _check_authored(self, path: Any) -> None:
-        """Refuse mass and density that USD would silently take for unauthored."""
-        prim = self.stage.GetPrimAtPath(path)
-        if not prim.HasAPI(self.px.UsdPhysics.MassAPI):
-            return
-        for name in ("physics:mass", "physics:density"):
-            value = prim.GetAttribute(name).Get()
-            if value is not None and not (math.isfinite(value) and value >= 0.0):
-                raise _Unusable(f"{path}: {name} is {written(value):g}; it must be finite and greater than zero")
-
-    def _authored_mass(self, prim: Any) -> dict[str, Any]:
-        """What the body prim itself says: mass, com (prim's local space), diagonal, axes; None where unauthored."""
-        result: dict[str, Any] = {"mass": None, "com": None, "diagonal": None, "axes": None, "zero": False}
-        if not prim.HasAPI(self.px.UsdPhysics.MassAPI):
-            return result
-        api = self.px.UsdPhysics.MassAPI(prim)
-        mass = api.GetMassAttr()
-        result["mass"] = written(mass.Get()) or None
-        result["zero"] = mass.HasAuthoredValue() and mass.Get() == 0.0 and not api.GetDensityAttr().Get()
-        com = _decimals(api.GetCenterOfMassAttr().Get())
-        if np.isfinite(com).all():
-            result["com"] = com
-        diagonal = _decimals(api.GetDiagonalInertiaAttr().Get())
-        if diagonal.any():
-            result["diagonal"], result["axes"] = diagonal, api.GetPrincipalAxesAttr().Get()
-        return result
-
-    def _unit_mass(self, prim: Any, body: _Frame, unknown: list[Any]) -> Any:
-        """Volume and inertia at unit density of one collider, stage units, for ComputeMassProperties."""
-        Gf = self.px.Gf
-        info = self.px.UsdPhysics.RigidBodyAPI.MassInformation()
-        frame = self._frame(prim.GetPath())
-        solid = self._solid(prim, self.colliders.get(prim.GetPath()), frame)
-        if solid is None:
-            unknown.append(prim.GetPath())
-            solid = (1.0, np.eye(3), np.zeros(3))
-        volume, inertia, centre = solid
-        info.volume = float(volume)
-        info.inertia = Gf.Matrix3f(*(volume * inertia).ravel().tolist())
-        info.centerOfMass = Gf.Vec3f(*centre.tolist())
-        info.localPos = Gf.Vec3f(*(body.rotation.T @ (frame.position - body.position)).tolist())
-        x, y, z, w = self._quaternion(body.rotation.T @ frame.rotation)
-        info.localRot = Gf.Quatf(w, x, y, z)
-        return info
-
-    def _solid(self, prim: Any, desc: Any, frame: _Frame) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """(volume, inertia [3, 3] per unit mass about the centre, centre) in the collider's frame; None = unknown."""
-        kind = "" if desc is None else str(desc.type).rpartition(".")[2]
-        if kind == "CubeShape":
-            half = self._half_extents(prim, frame)
-            return 8.0 * float(np.prod(half)), np.diag(half @ half - half**2) / 3.0, np.zeros(3)
-        if kind == "SphereShape":
-            radius = self._radius(prim) * frame.scale.max()
-            return 4.0 / 3.0 * math.pi * radius**3, 0.4 * radius**2 * np.eye(3), np.zeros(3)
-        if kind == "MeshShape":
-            return self._mesh_mass(prim, desc, frame)
-        if kind not in ("CapsuleShape", "CylinderShape", "ConeShape"):
-            return None
-        centre, axis = np.zeros(3), "XYZ".index(str(desc.axis).rpartition(".")[2])
-        # h: half the height, of a capsule that of its straight part.
-        r, h = self._capsule(prim, frame) if kind == "CapsuleShape" else round_solid(self.px, prim, kind, frame.scale).size
-        if kind == "CapsuleShape":
-            volume, along, across = capsule_solid(r, h)
-        elif kind == "CylinderShape":
-            volume, along, across = 2.0 * math.pi * r**2 * h, r**2 / 2, r**2 / 4 + h**2 / 3
-        else:
-            volume, along, across = 2.0 / 3.0 * math.pi * r**2 * h, 0.3 * r**2, 0.15 * r**2 + 0.15 * h**2
-            centre[axis] = -0.5 * h * frame.sign
-        return volume, np.diag(np.where(np.arange(3) == axis, along, across)), centre
-
-    def _mesh_mass(self, prim: Any, desc: Any, frame: _Frame) -> tuple[float, np.ndarray, np.ndarray] | None:
-        try:
-            solid = self._solid_of(prim, desc, frame)
-        except ModelError:
-            return None  # refused as a shape
-        if solid.hull is not None:
-            volume, centre, inertia = hulls.solid(solid.hull)
-            return volume, inertia, centre
-        if solid.kind is ShapeType.BOX:
-            half = np.array(solid.size)
-            return 8.0 * float(np.prod(half)), np.diag(half @ half - half**2) / 3.0, np.asarray(solid.centre)
-        if solid.kind is ShapeType.SPHERE:
-            return 4.0 / 3.0 * math.pi * solid.size[0] ** 3, 0.4 * solid.size[0] ** 2 * np.eye(3), np.asarray(solid.centre)
-        return None
 
     # -- shapes -----------------------------------------------------------------------------------------------------
 
@@ -699,7 +564,7 @@ class _Reader:
         if value is None:
             return np.zeros(3)
         self.read_attributes.add(attribute.GetPath())
-        return self.length * frame.sign * rotation.T @ frame.rotation @ _decimals(value)
+        return self.length * frame.sign * rotation.T @ frame.rotation @ decimals(value)
 
     def _material(self, prim: Any) -> Material:
         """Of the physics binding, which the prims above may hold; the parser itself sees only bindings on the collider."""
@@ -867,7 +732,3 @@ class _Reader:
         else:
             what = f"PhysicsCollisionAPI on {type_name or 'an untyped prim'}"
             self._repeat(path, what, "it is no geometry: apply it to the shapes below")
-
-
-def _decimals(values: Any) -> np.ndarray:
-    return np.array([written(v) for v in values])

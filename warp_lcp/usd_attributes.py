@@ -139,3 +139,8 @@ def _neutral(value: Any) -> bool:
 def written(value: float) -> float:
     """The decimal an author wrote: USD keeps single precision, in which 9.81 reads 9.8100004196."""
     return float(str(np.float32(value)))
+
+
+def decimals(values: Any) -> np.ndarray:
+    """The same of several numbers."""
+    return np.array([written(value) for value in values])
