@@ -233,6 +233,31 @@ def test_cylinder_rolls_down_a_slope(ground):
     assert np.abs(v[[1, 2, 3, 5]]).max() < 1e-6
 
 
+@pytest.mark.parametrize("kind", ["hull", "cylinder"])
+def test_sliding_over_tiles_trips_over_no_side(kind):
+    """Tiles of 0.5 m whose tops are flush, 4 m/s, 5 ms: as far as on one plane, and never off the ground.
+
+    Where it is now, a tile ahead is parted from it by its side; where the step leads, by its top, which is what it must meet.
+    """
+    ends = []
+    for tiles in (False, True):
+        b = wl.ModelBuilder()
+        if tiles:
+            for k in range(-2, 12):
+                b.add_hull(-1, CORNERS * [0.25, 2.0, 0.5], pose=(0.5 * k + 0.1, 0.0, -0.5, 0.0, 0.0, 0.0, 1.0))
+        else:
+            b.add_plane()
+        body = b.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1), velocity=(4.0, 0, 0))
+        b.add_hull(body, CORNERS * [0.2, 0.2, 0.1]) if kind == "hull" else b.add_cylinder(body, 0.2, 0.1)
+        sim = simulator(b, dt=5e-3)
+        for _ in range(160):
+            sim.step()
+            assert not sim.status.numpy().any()
+            assert abs(sim.q.numpy()[0, 2] - 0.1) < 1e-5
+        ends.append(sim.q.numpy()[0, 0])
+    assert ends[1] == pytest.approx(ends[0], abs=1e-4)
+
+
 @pytest.mark.parametrize("kind", ["cylinder", "cone", "hull"])
 def test_what_stands_stays(kind):
     """Two seconds on a plane and on a box: what is left of its speed is round-off."""
