@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections import Counter
 from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
@@ -85,6 +86,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
         "--variants", type=stability.chosen, metavar="all|some|NAME;...", help="laws and methods (default: all; with --quick: some)"
     )
     sub.add_argument("--envs", type=int, default=None, help="randomised copies of each case (default 4096; with --quick 64)")
+    sub.add_argument("--data", type=Path, nargs="+", metavar="FILE", help="tell and draw what is kept there; several: joined")
     sub = command("chart", run_chart, "speed against accuracy, beside other engines; pictures", out, quick, few, docs, device, place)
     sub.add_argument("--peers", type=peer_names, default=None, metavar="all|none|NAME,...", help="default: all; with --quick: none")
     sub.add_argument("--data", type=Path, nargs="+", metavar="FILE", help="tell and draw what is kept there; several: joined")
@@ -169,43 +171,58 @@ def run_accuracy(asked: argparse.Namespace) -> None:
         report.document("accuracy", accuracy.markdown(rows), folder / "accuracy.md")
 
 
+def joined(files: list[Path], what: str, *lists: str) -> tuple[dict[str, list[Any]], dict[str, Any]]:
+    """Results of a command that were kept, these lists of theirs one after the other, and what to keep with them of their circumstances."""
+    parts = []
+    for path in files:
+        try:
+            parts.append(json.loads(path.read_text()))
+            if any(not isinstance(parts[-1][name], list) for name in lists):
+                raise ValueError(f"{' or '.join(lists)} is no list")
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise SystemExit(f"python -m benchmarks: error: {path} holds no data of '{what}': {error}") from error
+    headers = [{name: value for name, value in part.items() if name not in lists} for part in parts]
+    return {name: [row for part in parts for row in part[name]] for name in lists}, {"parts": headers}
+
+
+def no_more_than_once(rows: list[dict[str, Any]], *names: str) -> None:
+    """Stop where two rows of joined results are of the same thing."""
+    seen = Counter(", ".join(str(row[name]) for name in names) for row in rows)
+    if again := [one for one, number in seen.items() if number > 1]:
+        raise SystemExit(f"python -m benchmarks: error: {len(again)} are in two of these files, the first: {again[0]}")
+
+
 def run_stability(asked: argparse.Namespace) -> None:
+    """Measured and kept, unless data are given; told and drawn. Parts that are joined are kept as one."""
     device = wp.get_device(asked.device)
-    variants = asked.variants or stability.chosen("some" if asked.quick else "all")
-    envs = asked.envs or (64 if asked.quick else 4096)
-    complete = asked.cases == list(CASES) and len(variants) == len(stability.VARIANTS) and envs >= 4096
-    rows = stability.measure(device, asked.cases, variants, asked.quick)
-    crowds = stability.crowd(device, asked.cases, envs)
+    if asked.data:
+        data, parts = joined(asked.data, "stability", "rows", "crowds")
+        no_more_than_once(data["rows"], "case", "variant", "h")
+        order = list(CASES)
+        rows = sorted(data["rows"], key=lambda row: order.index(row["case"]))
+        crowds = sorted(data["crowds"], key=lambda row: order.index(row["scene"]))
+    else:
+        variants = asked.variants or stability.chosen("some" if asked.quick else "all")
+        rows, parts = stability.measure(device, asked.cases, variants, asked.quick), {}
+        crowds = stability.crowd(device, asked.cases, asked.envs or (stability.QUICK_CROWD if asked.quick else stability.CROWD))
+    complete = stability.complete(rows, crowds)
     print(stability.markdown(rows, crowds))
-    keep(asked, device, {"rows": rows, "crowds": crowds}, complete)
+    if not asked.data or len(asked.data) > 1:
+        keep(asked, device, parts | {"rows": rows, "crowds": crowds}, complete)
     if folder := documents(asked, complete):
         report.document("stability", stability.markdown(rows, crowds), folder / "stability.md")
         stability_picture.draw(rows, folder / "stability")
-
-
-def chart_data(path: Path) -> dict[str, Any]:
-    """A chart's result."""
-    try:
-        data = json.loads(path.read_text())
-        if not isinstance(data["rows"], list):
-            raise ValueError("rows are no list")
-        return data
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SystemExit(f"python -m benchmarks: error: {path} holds no data of a chart: {error}") from error
 
 
 def run_chart(asked: argparse.Namespace) -> None:
     """Measured and kept after every case, unless data are given; told and drawn. Parts that are joined are kept as one."""
     device = wp.get_device(asked.device)
     if asked.data:
-        parts = [chart_data(path) for path in asked.data]
-        rows = [row for part in parts for row in part["rows"]]
-        if again := chart.twice(rows):
-            raise SystemExit(f"python -m benchmarks: error: {len(again)} points are in two of these files, the first: {again[0]}")
+        data, parts = joined(asked.data, "chart", "rows")
+        no_more_than_once(rows := data["rows"], "case", "engine", "setting", "knob")
         complete = chart.complete(rows)
-        if len(parts) > 1:
-            headers = [{name: value for name, value in part.items() if name != "rows"} for part in parts]
-            keep(asked, device, {"parts": headers, "rows": rows}, complete)
+        if len(asked.data) > 1:
+            keep(asked, device, parts | data, complete)
     else:
         names = asked.peers if asked.peers is not None else [] if asked.quick or device.is_cuda else list(peers.PEERS)
         if names and device.is_cuda:

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -270,12 +269,6 @@ def complete(rows: list[dict[str, Any]]) -> bool:
     settings += [(name, variant) for name, peer in PEERS.items() for variant in peer.variants]
     seen = {(row["case"], row["engine"], row["setting"], row["h"]) for row in rows}
     return seen >= {(case, *setting, h) for case in CHARTED for setting in settings for h in STEPS}
-
-
-def twice(rows: list[dict[str, Any]]) -> list[str]:
-    """Points that are there more than once."""
-    seen = Counter(", ".join(str(row[name]) for name in ("case", "engine", "setting", "knob")) for row in rows)
-    return [point for point, number in seen.items() if number > 1]
 
 
 def counts(row: dict[str, Any]) -> bool:

@@ -30,6 +30,7 @@ DRIFT = 10.0
 #: The energy, or a number, that nothing comes back from.
 BLOWN = 0.1
 LIMIT_S, QUICK_LIMIT_S = 5.0, 1.0  # of one run
+CROWD, QUICK_CROWD = 4096, 64  # randomised copies
 VERDICTS = {
     "survived": "S",
     "drifted": "D",
@@ -194,6 +195,13 @@ def crowd(device: Any, names: list[str], envs: int, h: float = 5e-3) -> list[dic
 
 
 # ------------------------------------------------------------------------------------------------------------------- reports
+
+
+def complete(rows: list[dict[str, Any]], crowds: list[dict[str, Any]]) -> bool:
+    """Is every case there under every variant and step, and in thousands of copies?"""
+    seen = {(row["case"], row["variant"], row["h"]) for row in rows}
+    copies = {row["scene"] for row in crowds if row["envs"] >= CROWD}
+    return copies >= set(CASES) and seen >= {(case, variant.name, h) for case in CASES for variant in VARIANTS for h in STEPS}
 
 
 def letters(rows: list[dict[str, Any]]) -> dict[tuple[str, str], str]:

@@ -287,10 +287,11 @@ def test_a_part_does_not_stand_beside_whole_results(tmp_path, monkeypatch):
     assert not (tmp_path / "docs").exists()
 
 
-def test_chart_of_no_data(tmp_path, monkeypatch):
+@pytest.mark.parametrize("what", ["chart", "stability"])
+def test_no_data(what, tmp_path, monkeypatch):
     (tmp_path / "x.json").write_text("{}")
-    monkeypatch.setattr(sys, "argv", ["benchmarks", "chart", "--data", str(tmp_path / "x.json")])
-    with pytest.raises(SystemExit, match="holds no data of a chart"):
+    monkeypatch.setattr(sys, "argv", ["benchmarks", what, "--data", str(tmp_path / "x.json")])
+    with pytest.raises(SystemExit, match=f"holds no data of '{what}'"):
         command.main()
 
 
@@ -319,8 +320,47 @@ def test_parts_of_a_chart_are_joined(tmp_path, monkeypatch, capsys):
 
     assert join(rows[:5], rows[5:]) == rows
     assert join(rows[:5], rows[9:]) == rows[:5] + rows[9:]
-    with pytest.raises(SystemExit, match=r"1 points are in two of these files, the first: box, warp_lcp, default, 0\.1 ms"):
+    with pytest.raises(SystemExit, match=r"1 are in two of these files, the first: box, warp_lcp, default, 0\.1 ms"):
         join(rows[:7], rows[6:])
+
+
+def test_parts_of_stability_are_joined(tmp_path, monkeypatch):
+    """Whole where every case is there under every variant and step, and in thousands of copies; in the order of the cases."""
+    monkeypatch.setattr(report, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(report, "PARTIAL", tmp_path / "parts")
+    monkeypatch.setattr(stability, "VARIANTS", stability.chosen("default; pgs"))
+    monkeypatch.setattr(stability, "markdown", lambda rows, crowds: "")
+    monkeypatch.setattr(stability_picture, "draw", lambda *_: [])
+    monkeypatch.setattr(report, "document", lambda *_: None)
+
+    def part(names: list[str], envs: int = 4096) -> dict:
+        rows = [
+            {"case": case, "variant": variant.name, "h": h, "verdict": "survived", "reason": ""}
+            for case in names
+            for variant in stability.VARIANTS
+            for h in stability.STEPS
+        ]
+        return {"rows": rows, "crowds": [{"scene": case, "envs": envs} for case in names]}
+
+    def join(*parts: dict) -> None:
+        files = [tmp_path / f"{i}.json" for i in range(len(parts))]
+        for file, data in zip(files, parts, strict=True):
+            file.write_text(json.dumps({"device": file.stem} | data))
+        monkeypatch.setattr(sys, "argv", ["benchmarks", "stability", "--data", *map(str, files)])
+        command.main()
+
+    names = list(CASES)
+    join(part(names[7:]), part(names[:7]))
+    (kept,) = (tmp_path / "results").glob("*-stability-cpu.json")
+    assert json.loads(kept.read_text())["rows"] == part(names)["rows"]
+    assert [row["scene"] for row in json.loads(kept.read_text())["crowds"]] == names
+    assert not (tmp_path / "parts").exists()
+    for fewer in (part(names[1:7]), part(names[:7], envs=4000)):
+        join(part(names[7:]), fewer)
+        (kept,) = (tmp_path / "parts").glob("*-stability-cpu.json")
+        kept.unlink()
+    with pytest.raises(SystemExit, match=f"10 are in two of these files, the first: {names[6]}, default, 0.001"):
+        join(part(names[6:]), part(names[:7]))
 
 
 TABLES = {
