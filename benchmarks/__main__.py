@@ -1,8 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""python -m benchmarks accuracy|stability|chart|speed|peers|friction|lcp|paper|dynamics|robots|robust|resources|needs|regression|all
-
---help says what each does.
-"""
+"""python -m benchmarks COMMAND: accuracy, stability, the chart, speed and the rest; --help says what each does."""
 
 from __future__ import annotations
 
@@ -37,13 +34,28 @@ from . import (
     speed,
     stability,
     stability_picture,
+    start_up,
     step_floor,
 )
 from .cases import CASES, case_names
 from .peers import compare
 
 #: What `all` does, in this order; together they make every number and picture of README and docs.
-EVERYTHING = ("speed", "accuracy", "stability", "chart", "friction", "lcp", "paper", "dynamics", "robots", "robust", "resources", "needs")
+EVERYTHING = (
+    "start-up",
+    "speed",
+    "accuracy",
+    "stability",
+    "chart",
+    "friction",
+    "lcp",
+    "paper",
+    "dynamics",
+    "robots",
+    "robust",
+    "resources",
+    "needs",
+)
 
 
 def peer_names(text: str, known: Collection[str] = tuple(peers.PEERS)) -> list[str]:
@@ -90,9 +102,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     sub = command("chart", run_chart, "speed against accuracy, beside other engines; pictures", out, quick, few, docs, device, place)
     sub.add_argument("--peers", type=peer_names, default=None, metavar="all|none|NAME,...", help="default: all; with --quick: none")
     sub.add_argument("--data", type=Path, nargs="+", metavar="FILE", help="tell and draw what is kept there; several: joined")
-    sub = command(
-        "speed", run_speed, "env-steps/s of the paper's box, start-up, mass ratios, fallback, floors, peers", out, quick, place, device
-    )
+    sub = command("speed", run_speed, "env-steps/s of the paper's box, mass ratios, fallback, floors, peers", out, quick, place, device)
     sub.add_argument(
         "--peers", type=peer_names, default=",".join(peers.FAST), metavar="all|none|NAME,...", help="default: %(default)s, where installed"
     )
@@ -116,6 +126,12 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     sub.add_argument("--formulations", type=lambda text: text.split(","), default=["phantom_inertia", "coulomb"], metavar="NAME,...")
     sub.add_argument("--envs", type=int, default=4096, help="environments of each scene (default 4096)")
     sub.add_argument("--seconds", type=float, default=10.0, help="simulated time (default 10)")
+    command(
+        "start-up",
+        run_start_up,
+        "from a fresh process to the first step of robots and others, with an empty cache and a full one (CPU)",
+        out,
+    )
     command("resources", run_resources, "what the kernels take of a GPU", out)
     command("needs", run_needs, "what each scene takes and uses, and what features elsewhere cost it (CPU)", out, quick)
     sub = command("regression", run_regression, "what got worse since the result that was kept last; status 1 if anything did")
@@ -260,11 +276,10 @@ def compared(names: list[str], quick: bool, folder: Path) -> dict[str, Any]:
 def run_speed(asked: argparse.Namespace) -> None:
     device = wp.get_device(asked.device)
     rows = speed.measure(device, quick=asked.quick)
-    start = speed.start_up()
-    print(speed.markdown(rows, start))
+    print(speed.markdown(rows))
     stacks, failures, floors = goals.mass_ratio(asked.quick), goals.fallback(device, asked.quick), step_floor.measure(asked.quick)
     print(f"\n{goals.markdown(stacks, failures)}\n\n{step_floor.markdown(floors)}")
-    data = {"start_up": start, "rows": rows, "mass_ratio": stacks, "fallback": failures, "step_floor": floors}
+    data = {"rows": rows, "mass_ratio": stacks, "fallback": failures, "step_floor": floors}
     report.write(target(asked, True), asked.what, device, data)  # kept if a peer fails
     keep(asked, device, data | compared(asked.peers, asked.quick, asked.dir))
 
@@ -349,6 +364,12 @@ def run_robust(asked: argparse.Namespace) -> None:
     keep(asked, device, {"rows": rows})
 
 
+def run_start_up(asked: argparse.Namespace) -> None:
+    rows = start_up.measure()
+    print(start_up.markdown(rows))
+    keep(asked, wp.get_device("cpu"), {"rows": rows})
+
+
 def run_resources(asked: argparse.Namespace) -> None:
     table = [row for precision in ("float64", "float32") for row in resources.measure(precision)]
     print(resources.markdown(table))
@@ -376,7 +397,7 @@ def run_regression(asked: argparse.Namespace) -> None:
 def run_all(asked: argparse.Namespace) -> None:
     for name in EVERYTHING:
         print(f"\n# {name}\n", flush=True)
-        takes_quick = name not in ("robust", "resources")
+        takes_quick = name not in ("start-up", "robust", "resources")
         again = arguments([name, *(["--quick"] if asked.quick and takes_quick else [])])
         again.run(again)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Environment steps per second of the paper's box, and start-up times.
+"""Environment steps per second of the paper's box.
 
 Three states, one movable body: at rest, sliding (the paper's example while it slides) and dropped tumbling, with a random
 state for each environment: it lands within 0.1 s of the 0.25 s that are timed. On the CPU everything runs on one core.
@@ -8,13 +8,8 @@ Each figure is the median of several repetitions from the same start; the spread
 
 from __future__ import annotations
 
-import os
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -78,30 +73,10 @@ def measure(device: wp.Device, quick: bool) -> list[dict[str, Any]]:
     return [one(device, *case, 3 if quick else 15) for case in tqdm(cases, desc="speed", disable=None)]
 
 
-def start_up() -> dict[str, float]:
-    """Seconds of a fresh process: import, first step with a cold kernel cache, first step with a warm one."""
-    code = (
-        "import time; a = time.perf_counter(); import warp_lcp as wl; wl.Simulator; b = time.perf_counter();"
-        "import warp as wp; wp.config.log_level = wp.LOG_WARNING; from benchmarks import scenes;"
-        "c = time.perf_counter(); sim = scenes.scene('slide', 1).simulator(device='cpu'); sim.step(); sim.q.numpy();"
-        "print(b - a, time.perf_counter() - c)"
-    )
-    result = {}
-    with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"WARP_CACHE_PATH": cache}
-        for name in ("cold", "warm"):
-            done = subprocess.run(
-                [sys.executable, "-c", code], env=environment, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True
-            )
-            result["import_s"], result[f"{name}_first_step_s"] = (float(x) for x in done.stdout.split()[-2:])
-    return result
-
-
-def markdown(rows: list[dict[str, Any]], start: dict[str, float]) -> str:
-    """Tables: start-up, and env-steps/s by method and batch size."""
-    lines = [", ".join(f"{key} {value:.2f}" for key, value in start.items()), ""]
+def markdown(rows: list[dict[str, Any]]) -> str:
+    """Env-steps/s by method and batch size."""
     sizes = sorted({row["envs"] for row in rows})
-    lines += ["| method | precision | state | " + " | ".join(f"{n} envs" for n in sizes) + " | iterations | marked envs |"]
+    lines = ["| method | precision | state | " + " | ".join(f"{n} envs" for n in sizes) + " | iterations | marked envs |"]
     lines += ["|" + " --- |" * (5 + len(sizes))]
     for method, precision in COMBINATIONS:
         for state in STATES:

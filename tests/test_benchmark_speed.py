@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from benchmarks import goals, scenes, step_floor
+from benchmarks import goals, scenes, start_up, step_floor
 
 
 def test_mass_ratio():
@@ -105,3 +105,11 @@ def test_floor_of_a_step():
     assert total["read_bytes"] == sum(row["read_bytes"] for row in launches)
     assert step["ns"] > max(step["memory_floor_ns"], step["arithmetic_floor_ns"])
     assert f"| {launches[0]['kernel']} |" in step_floor.markdown(data)
+
+
+def test_start_up():
+    """Two processes: the second one finds the modules that the first one has compiled."""
+    row = start_up.one("box", "box_on_ground")
+    assert row["modules"] > 0
+    assert 0.0 < row["read_s"] < row["warm_s"] < row["cold_s"]
+    assert f"| box | {row['cold_s']:.1f} | {row['warm_s']:.2f} |" in start_up.markdown([row])
