@@ -149,27 +149,24 @@ def _seams(mesh: Mesh) -> np.ndarray:
     p = mesh.points[mesh.triangles]
     normals = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     normals /= np.linalg.norm(normals, axis=1)[:, None]
-    at: dict[tuple[int, int], list[tuple[int, int]]] = {}
     _, same = np.unique(mesh.points, axis=0, return_inverse=True)  # files repeat points where faces meet
-    for t, corners in enumerate(same.reshape(-1)[mesh.triangles].tolist()):
-        for k in range(3):
-            a, b = corners[k], corners[(k + 1) % 3]
-            at.setdefault((min(a, b), max(a, b)), []).append((t, k))
-    front, back = np.zeros(len(p), dtype=np.int32), np.zeros(len(p), dtype=np.int32)
-    for sides in at.values():
-        if len(sides) == 2 and abs(normals[sides[0][0]] @ normals[sides[1][0]]) > 1.0 - 0.5 * SEAM**2 and _across(p, sides):
-            for t, k in sides:
-                front[t] |= 1 << k
-                back[t] |= 1 << (1 - k) % 3  # the back has corners 2, 1, 0
-    return np.stack([front, back], axis=1).reshape(-1)
-
-
-def _across(p: np.ndarray, sides: list[tuple[int, int]]) -> bool:
-    """Are two triangles on either side of the side that they share, not folded onto each other?"""
-    (a, i), (b, j) = sides
-    e = p[a, (i + 1) % 3] - p[a, i]
-    off_a, off_b = p[a, (i + 2) % 3] - p[a, i], p[b, (j + 2) % 3] - p[a, i]
-    return bool(np.cross(e, off_a) @ np.cross(e, off_b) < 0.0)
+    corners = same.reshape(-1)[mesh.triangles]
+    ends = np.sort(np.stack([corners, np.roll(corners, -1, axis=1)], axis=-1), axis=-1).reshape(
+        -1, 2
+    )  # [3 T, 2], side k of triangle t at 3 t + k
+    _, edge, uses = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
+    edge = edge.reshape(-1)
+    shared = np.argsort(edge, kind="stable")[np.repeat(uses == 2, uses)].reshape(-1, 2)  # of two triangles
+    (a, i), (b, j) = (divmod(shared[:, side], 3) for side in (0, 1))
+    along = p[a, (i + 1) % 3] - p[a, i]
+    off = [p[t, (k + 2) % 3] - p[a, i] for t, k in ((a, i), (b, j))]
+    apart = (np.cross(along, off[0]) * np.cross(along, off[1])).sum(axis=1) < 0.0  # on either side of it, not folded onto each other
+    flat = apart & (np.abs((normals[a] * normals[b]).sum(axis=1)) > 1.0 - 0.5 * SEAM**2)
+    t, k = divmod(shared[flat].reshape(-1), 3)
+    seams = np.zeros((len(p), 2), dtype=np.int32)
+    np.bitwise_or.at(seams[:, 0], t, 1 << k)
+    np.bitwise_or.at(seams[:, 1], t, 1 << (1 - k) % 3)  # the back has corners 2, 1, 0
+    return seams.reshape(-1)
 
 
 def _tree(mesh: Mesh, device: Any) -> wp.Mesh:
