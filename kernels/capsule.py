@@ -434,12 +434,15 @@ def make(real) -> dict:
                 near = reach(topology, bodies, env, sa, centre, wp.length(size), h) + reach(topology, bodies, env, sb, middle, half + r, h)
                 for k in range(3):
                     slots.gap[env, slot + k] = real(NO_POINT)
-                if wp.length(middle - centre) < wp.length(size) + half + r + near:
-                    turn = wp.transform_get_rotation(box)
+                turn = wp.transform_get_rotation(box)
+                c = wp.transform_point(wp.transform_inverse(box), middle)
+                if wp.length(outside_box(c, size)) < half + r + near:
                     axis = z_axis(capsule)
-                    c = wp.transform_point(wp.transform_inverse(box), middle)
                     e = wp.quat_rotate_inv(turn, axis)
-                    if wp.length(outside_box(c + e * nearest_to_box(c, e, half, size), size)) > real(MEETS) * r:
+                    distance = wp.length(outside_box(c + e * nearest_to_box(c, e, half, size), size))
+                    if distance <= real(MEETS) * r:
+                        inside_box(slots, env, slot, box, size, c, e, half, r, near)
+                    elif distance - r < near:
                         motion = relative_motion(topology, bodies, env, sa, sb, h)
                         motion.near = near
                         move = shift(topology, bodies, env, sb, middle, h) - shift(topology, bodies, env, sa, centre, h)
@@ -451,8 +454,6 @@ def make(real) -> dict:
                         motion.distance = wp.length(out)
                         motion.normal = wp.quat_rotate(turn, wp.quat_rotate(further, out))
                         beside_box(slots, env, slot, box, size, c, e, half, r, motion)
-                    else:
-                        inside_box(slots, env, slot, box, size, c, e, half, r, near)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def capsule_capsule(
@@ -485,9 +486,12 @@ def make(real) -> dict:
                 near = reach(topology, bodies, env, sa, origin, la + ra, h) + reach(topology, bodies, env, sb, middle, lb + rb, h)
                 for k in range(3):
                     slots.gap[env, slot + k] = real(NO_POINT)
-                if wp.length(d) < la + ra + lb + rb + near:
-                    ea = z_axis(a)
-                    eb = z_axis(b)
+                ea = z_axis(a)
+                eb = z_axis(b)
+                nearest = d + eb * nearest_to_segment(d, eb, lb, ea, la)
+                out = outside_segment(nearest, ea, la)
+                distance = wp.length(out)
+                if distance - (ra + rb) < near:
                     motion = relative_motion(topology, bodies, env, sa, sb, h)
                     motion.near = near
                     ahead = d + shift(topology, bodies, env, sb, middle, h) - shift(topology, bodies, env, sa, origin, h)
@@ -497,9 +501,6 @@ def make(real) -> dict:
                     motion.normal = outside_segment(nearest_ahead, ea_ahead, la)
                     motion.distance = wp.length(motion.normal)
 
-                    nearest = d + eb * nearest_to_segment(d, eb, lb, ea, la)
-                    out = outside_segment(nearest, ea, la)
-                    distance = wp.length(out)
                     # Segments that meet part across both, or where they are parallel, across one.
                     least = real(MEETS) * rb
                     across = perpendicular(ea)
