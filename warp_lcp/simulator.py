@@ -467,17 +467,17 @@ class Simulator:
         else:
             self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
         if self.model.bounded:
-            lanes = 1 if self.device.is_cpu else len(self.model.shape_body)
+            lanes = self.lanes(len(self.model.shape_body))
             self.launch(k.bounds, [self.topology, self.bodies, h, lanes], lanes)
             pairs = [self.topology.pairs, self.topology.pair_slots, self._kind_pairs, self._plane_kinds]
             self.launch(k.list_pairs, [*pairs, self.bodies.bounds, self.slots.gap, self.slots.last_feature, self.listed])
         for kind, (kernel, number, with_hulls) in enumerate(self._pair_kernels):
-            more, lanes = [self.hulls] if with_hulls else [], 1 if self.device.is_cpu else number
+            more, lanes = [self.hulls] if with_hulls else [], self.lanes(number)
             self.launch(kernel, [*scene, self.bodies, self.listed, kind, h, self.slots, *more, lanes], lanes)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.listed, self.slots, h, self.rows, self.status])
         if not self._methods[0].makes_rows:
-            lanes = 1 if self.device.is_cpu else self.model.max_contacts
+            lanes = self.lanes(self.model.max_contacts)
             self.launch(k.contact_rows, [*scene, self.mechanics, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
             if self.model.articulated and self.model.bodies_meet:
                 self.launch(k.calm_overlaps, [self.mechanics, self.rows, lanes], lanes)
@@ -559,6 +559,10 @@ class Simulator:
         """
         threads = 1 if self.device.is_cpu else self.num_envs
         wp.launch(kernel, dim=(threads, width), inputs=[*inputs, threads], device=self.device)
+
+    def lanes(self, number: int) -> int:
+        """Threads that share `number` things of an environment: on a GPU one for each, on the CPU one for all."""
+        return 1 if self.device.is_cpu else number
 
     def _captured(self, name: str, launches: Callable[[], None]) -> Any:
         """The graph of some launches, captured when first asked for."""
