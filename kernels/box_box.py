@@ -157,7 +157,7 @@ def polygon(real) -> SimpleNamespace:
 
 @functools.cache
 def make(real):
-    """Kernel ``box_box``; launch with dim (E, pairs of boxes)."""
+    """Kernel ``box_box``; launch with dim (E, lanes)."""
     t = scalar_types(real)
     vec3, mat33, transform = t.vec3, t.mat33, t.transform
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology

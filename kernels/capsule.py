@@ -164,7 +164,7 @@ def segment_functions(real) -> SimpleNamespace:
 
 @functools.cache
 def make(real) -> dict:
-    """Kernels by the names of the two shape types; launch with dim (E, pairs of that kind), as those of ``collide``."""
+    """Kernels by the names of the two shape types; launch with dim (E, lanes), as those of ``collide``."""
     t = scalar_types(real)
     vec3, transform = t.vec3, t.transform
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology

@@ -331,7 +331,7 @@ def meeting(real):
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """Kernels ``sharp`` (cylinders, cones, hulls and boxes with each other) and ``on_plane``; launch with dim (E, pairs of a kind)."""
+    """Kernels ``sharp`` (cylinders, cones, hulls and boxes with each other) and ``on_plane``; launch with dim (E, lanes)."""
     t = scalar_types(real)
     vec3 = t.vec3
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology

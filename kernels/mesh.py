@@ -26,7 +26,7 @@ SAME = wp.constant(1.0e-6)
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """Kernels ``sharp_on_mesh`` and ``round_on_mesh``; launch with dim (E, pairs of a kind)."""
+    """Kernels ``sharp_on_mesh`` and ``round_on_mesh``; launch with dim (E, lanes)."""
     t = scalar_types(real)
     vec3, transform = t.vec3, t.transform
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology

@@ -341,7 +341,7 @@ def meeting(real):
 
 @functools.cache
 def make(real):
-    """Kernel ``rounded``; launch with dim (E, pairs of a kind)."""
+    """Kernel ``rounded``; launch with dim (E, lanes)."""
     t = scalar_types(real)
     vec3 = t.vec3
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
