@@ -157,13 +157,12 @@ def polygon(real) -> SimpleNamespace:
 
 @functools.cache
 def make(real):
-    """Kernel ``box_box``; launch with dim (E, pairs of boxes)."""
+    """Kernel ``box_box``; launch with dim (E, lanes)."""
     t = scalar_types(real)
     vec3, mat33, transform = t.vec3, t.mat33, t.transform
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, a, p = pair_functions(real), axes(real), polygon(real)
     shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
-    far_apart, set_apart = f.far_apart, f.set_apart
     face_separation, edge_axis, edge_separation, column, rank = a.face_separation, a.edge_axis, a.edge_separation, a.column, a.rank
     inverse_mass, touching_depth = a.inverse_mass, a.touching_depth
     Polygon, clip = p.Polygon, p.clip
@@ -355,120 +354,130 @@ def make(real):
         return 1
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def box_box(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
-        start, index = wp.tid()
+    def box_box(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + index
-            sa = topology.pairs[pair, 0]
-            sb = topology.pairs[pair, 1]
-            if far_apart(bodies, env, sa, sb):
-                set_apart(topology, slots, env, pair)
-                continue
-            ha = topology.shape_size[sa]
-            hb = topology.shape_size[sb]
-            xa = shape_pose(topology, bodies, env, sa)
-            xb = shape_pose(topology, bodies, env, sb)
-            ca = wp.transform_get_translation(xa)
-            cb = wp.transform_get_translation(xb)
-            slot = topology.pair_slots[pair]
-            count = int(0)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                sa = topology.pairs[pair, 0]
+                sb = topology.pairs[pair, 1]
+                ha = topology.shape_size[sa]
+                hb = topology.shape_size[sb]
+                xa = shape_pose(topology, bodies, env, sa)
+                xb = shape_pose(topology, bodies, env, sb)
+                ca = wp.transform_get_translation(xa)
+                cb = wp.transform_get_translation(xb)
+                slot = topology.pair_slots[pair]
+                count = int(0)
 
-            ra = wp.length(ha)
-            rb = wp.length(hb)
-            apart = ra + reach(topology, bodies, env, sa, ca, ra, h) + rb + reach(topology, bodies, env, sb, cb, rb, h)
-            if wp.length(cb - ca) < apart:
-                rotation = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(xa))) * wp.quat_to_matrix(wp.transform_get_rotation(xb))
-                d = wp.transform_point(wp.transform_inverse(xa), cb)
-                # Axes are compared where the present velocities lead in a step. Now, a box that slides from one tile to the
-                # next is separated from the next by its side, and would trip over it; then, it overlaps the side by
-                # millimetres and the top by nothing.
-                u = shape_velocity(topology, bodies, bodies.velocity, env, sb, cb) - shape_velocity(
-                    topology, bodies, bodies.velocity, env, sa, ca
-                )
-                ahead = d + h * wp.quat_rotate_inv(wp.transform_get_rotation(xa), u)
-                back = wp.transpose(rotation)
-                d_b = back * d
-                ahead_b = back * ahead
-                # Prefer faces over edges and a over b, so that equal separations do not flip from step to step.
-                smallest = wp.min(wp.min(ha), wp.min(hb))
-                bias = real(1.0e-3) * smallest
-                inverse_a = inverse_mass(topology, bodies, env, sa)
-                inverse_b = inverse_mass(topology, bodies, env, sb)
-                gravity = parameters.gravity[env % parameters.gravity.shape[0]]
-                stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
-                depth = touching_depth(gravity, inverse_a, inverse_b, stiffness)
-                touching = wp.clamp(depth[1], depth[0] * smallest, depth[2] * smallest)
-                far = real(2.0) * apart
-                best = real(-2.0) * far
-                axis = int(0)
-                for k in range(3):
-                    s = rank(face_separation(d, rotation, ha, hb, k), face_separation(ahead, rotation, ha, hb, k), touching, far)
-                    if s > best:
-                        best = s
-                        axis = k
-                best_b = best + bias
-                for k in range(3):
-                    s = rank(face_separation(d_b, back, hb, ha, k), face_separation(ahead_b, back, hb, ha, k), touching, far)
-                    if s > best_b:
-                        best_b = s
-                        best = s
-                        axis = 3 + k
-                best_edge = best + bias
-                for ij in range(9):
-                    n = edge_axis(rotation, ij // 3, ij % 3)
-                    if wp.dot(n, n) > real(0.0):
-                        s = rank(edge_separation(d, rotation, ha, hb, n), edge_separation(ahead, rotation, ha, hb, n), touching, far)
-                        if s > best_edge:
-                            best_edge = s
-                            axis = 6 + ij
-                # Levers are those of the lighter box, which turns more easily.
-                share = real(0.5)
-                if inverse_a + inverse_b > real(0.0):
-                    share = inverse_b / (inverse_a + inverse_b)
-                if axis < 3:
-                    count = face_contacts(slots, env, slot, xa, ha, xb, hb, axis, False, h * u, share)
-                elif axis < 6:
-                    count = face_contacts(slots, env, slot, xb, hb, xa, ha, axis - 3, True, -h * u, real(1.0) - share)
-                else:
-                    i = (axis - 6) // 3
-                    j = (axis - 6) % 3
-                    crossing = edge_crossing(d, rotation, ha, hb, i, j, edge_axis(rotation, i, j))
-                    normal = wp.transform_vector(xa, crossing.normal)
-                    write(slots, env, slot, wp.transform_point(xa, crossing.point), normal, crossing.gap, crossing.feature)
-                    count = 1
-                    # The edge of b over a face of a, and that of a over a face of b.
-                    n = crossing.normal
-                    near = crossing.point
-                    count += edge_over_face(
-                        slots,
-                        env,
-                        slot + count,
-                        xa,
-                        ha,
-                        crossing.edge_b,
-                        column(rotation, crossing.j),
-                        hb[crossing.j],
-                        n,
-                        near,
-                        real(1.0),
-                        crossing.gap,
+                ra = wp.length(ha)
+                rb = wp.length(hb)
+                apart = ra + reach(topology, bodies, env, sa, ca, ra, h) + rb + reach(topology, bodies, env, sb, cb, rb, h)
+                if wp.length(cb - ca) < apart:
+                    rotation = wp.transpose(wp.quat_to_matrix(wp.transform_get_rotation(xa))) * wp.quat_to_matrix(
+                        wp.transform_get_rotation(xb)
                     )
-                    c = back * (crossing.edge_a - d)
-                    count += edge_over_face(
-                        slots,
-                        env,
-                        slot + count,
-                        xb,
-                        hb,
-                        c,
-                        column(back, crossing.i),
-                        ha[crossing.i],
-                        -(back * n),
-                        back * (near - d),
-                        real(-1.0),
-                        crossing.gap,
+                    d = wp.transform_point(wp.transform_inverse(xa), cb)
+                    # Axes are compared where the present velocities lead in a step. Now, a box that slides from one tile to the
+                    # next is separated from the next by its side, and would trip over it; then, it overlaps the side by
+                    # millimetres and the top by nothing.
+                    u = shape_velocity(topology, bodies, bodies.velocity, env, sb, cb) - shape_velocity(
+                        topology, bodies, bodies.velocity, env, sa, ca
                     )
-            for k in range(count, 8):
-                slots.gap[env, slot + k] = real(NO_POINT)
+                    ahead = d + h * wp.quat_rotate_inv(wp.transform_get_rotation(xa), u)
+                    back = wp.transpose(rotation)
+                    d_b = back * d
+                    ahead_b = back * ahead
+                    # Prefer faces over edges and a over b, so that equal separations do not flip from step to step.
+                    smallest = wp.min(wp.min(ha), wp.min(hb))
+                    bias = real(1.0e-3) * smallest
+                    inverse_a = inverse_mass(topology, bodies, env, sa)
+                    inverse_b = inverse_mass(topology, bodies, env, sb)
+                    gravity = parameters.gravity[env % parameters.gravity.shape[0]]
+                    stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
+                    depth = touching_depth(gravity, inverse_a, inverse_b, stiffness)
+                    touching = wp.clamp(depth[1], depth[0] * smallest, depth[2] * smallest)
+                    far = real(2.0) * apart
+                    best = real(-2.0) * far
+                    axis = int(0)
+                    for k in range(3):
+                        s = rank(face_separation(d, rotation, ha, hb, k), face_separation(ahead, rotation, ha, hb, k), touching, far)
+                        if s > best:
+                            best = s
+                            axis = k
+                    best_b = best + bias
+                    for k in range(3):
+                        s = rank(face_separation(d_b, back, hb, ha, k), face_separation(ahead_b, back, hb, ha, k), touching, far)
+                        if s > best_b:
+                            best_b = s
+                            best = s
+                            axis = 3 + k
+                    best_edge = best + bias
+                    for ij in range(9):
+                        n = edge_axis(rotation, ij // 3, ij % 3)
+                        if wp.dot(n, n) > real(0.0):
+                            s = rank(edge_separation(d, rotation, ha, hb, n), edge_separation(ahead, rotation, ha, hb, n), touching, far)
+                            if s > best_edge:
+                                best_edge = s
+                                axis = 6 + ij
+                    # Levers are those of the lighter box, which turns more easily.
+                    share = real(0.5)
+                    if inverse_a + inverse_b > real(0.0):
+                        share = inverse_b / (inverse_a + inverse_b)
+                    if axis < 3:
+                        count = face_contacts(slots, env, slot, xa, ha, xb, hb, axis, False, h * u, share)
+                    elif axis < 6:
+                        count = face_contacts(slots, env, slot, xb, hb, xa, ha, axis - 3, True, -h * u, real(1.0) - share)
+                    else:
+                        i = (axis - 6) // 3
+                        j = (axis - 6) % 3
+                        crossing = edge_crossing(d, rotation, ha, hb, i, j, edge_axis(rotation, i, j))
+                        normal = wp.transform_vector(xa, crossing.normal)
+                        write(slots, env, slot, wp.transform_point(xa, crossing.point), normal, crossing.gap, crossing.feature)
+                        count = 1
+                        # The edge of b over a face of a, and that of a over a face of b.
+                        n = crossing.normal
+                        near = crossing.point
+                        count += edge_over_face(
+                            slots,
+                            env,
+                            slot + count,
+                            xa,
+                            ha,
+                            crossing.edge_b,
+                            column(rotation, crossing.j),
+                            hb[crossing.j],
+                            n,
+                            near,
+                            real(1.0),
+                            crossing.gap,
+                        )
+                        c = back * (crossing.edge_a - d)
+                        count += edge_over_face(
+                            slots,
+                            env,
+                            slot + count,
+                            xb,
+                            hb,
+                            c,
+                            column(back, crossing.i),
+                            ha[crossing.i],
+                            -(back * n),
+                            back * (near - d),
+                            real(-1.0),
+                            crossing.gap,
+                        )
+                for k in range(count, 8):
+                    slots.gap[env, slot + k] = real(NO_POINT)
 
     return box_box

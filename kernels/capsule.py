@@ -164,13 +164,13 @@ def segment_functions(real) -> SimpleNamespace:
 
 @functools.cache
 def make(real) -> dict:
-    """Kernels by the names of the two shape types; launch with dim (E, pairs of that kind), as those of ``collide``."""
+    """Kernels by the names of the two shape types; launch with dim (E, lanes), as those of ``collide``."""
     t = scalar_types(real)
     vec3, transform = t.vec3, t.transform
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, g = pair_functions(real), segment_functions(real)
-    shape_pose, reach, set_apart, shape_velocity = f.shape_pose, f.reach, f.set_apart, f.shape_velocity
-    far_apart, shape_turn, rotation, shift = f.far_apart, f.shape_turn, f.rotation, f.shift
+    shape_pose, reach, shape_velocity = f.shape_pose, f.reach, f.shape_velocity
+    shape_turn, rotation, shift = f.shape_turn, f.rotation, f.shift
     write, write_bent = f.write, f.write_bent
     outside_box, bend, whole, cut, direction, perpendicular = f.outside_box, f.bend, g.whole, g.cut, g.direction, g.perpendicular
     outside_segment, nearest_to_box, nearest_to_segment = g.outside_segment, g.nearest_to_box, g.nearest_to_segment
@@ -226,47 +226,66 @@ def make(real) -> dict:
             write_bent(slots, env, slot, p - n * (radius + real(0.5) * gap), n, gap, left, feature)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def plane_capsule(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
-        start, i = wp.tid()
+    def plane_capsule(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + i
-            plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
-            capsule = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
-            size = topology.shape_size[topology.pairs[pair, 1]]
-            normal = z_axis(plane)
-            for k in range(2):
-                centre = wp.transform_point(capsule, vec3(real(0.0), real(0.0), real(2 * k - 1) * size[1]))
-                gap = wp.dot(normal, centre - wp.transform_get_translation(plane)) - size[0]
-                point = centre - normal * (size[0] + real(0.5) * gap)
-                write(slots, env, topology.pair_slots[pair] + k, point, normal, gap, 0)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
+                capsule = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
+                size = topology.shape_size[topology.pairs[pair, 1]]
+                normal = z_axis(plane)
+                for k in range(2):
+                    centre = wp.transform_point(capsule, vec3(real(0.0), real(0.0), real(2 * k - 1) * size[1]))
+                    gap = wp.dot(normal, centre - wp.transform_get_translation(plane)) - size[0]
+                    point = centre - normal * (size[0] + real(0.5) * gap)
+                    write(slots, env, topology.pair_slots[pair] + k, point, normal, gap, 0)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def sphere_capsule(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
-        start, i = wp.tid()
+    def sphere_capsule(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + i
-            sa = topology.pairs[pair, 0]
-            sb = topology.pairs[pair, 1]
-            if far_apart(bodies, env, sa, sb):
-                set_apart(topology, slots, env, pair)
-                continue
-            ra = topology.shape_size[sa][0]
-            rb = topology.shape_size[sb][0]
-            half = topology.shape_size[sb][1]
-            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, sa))
-            capsule = shape_pose(topology, bodies, env, sb)
-            axis = z_axis(capsule)
-            p = centre - wp.transform_get_translation(capsule)
-            out = outside_segment(p, axis, half)
-            distance = wp.length(out)
-            n = direction(out, distance, real(MEETS) * rb, perpendicular(axis))  # from the capsule to the sphere
-            gap = distance - ra - rb
-            u = shape_velocity(topology, bodies, bodies.velocity, env, sa, centre)
-            closing = h * (u - shape_velocity(topology, bodies, bodies.velocity, env, sb, centre))
-            move = shift(topology, bodies, env, sa, centre, h) - shift(topology, bodies, env, sb, centre - p, h)
-            ahead = outside_segment(p + move, wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), axis), half)
-            b = bend(gap, distance, n, closing, wp.length(ahead), ahead)
-            write_bent(slots, env, topology.pair_slots[pair], centre - n * (ra + real(0.5) * gap), -n, gap, b, 0)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                sa = topology.pairs[pair, 0]
+                sb = topology.pairs[pair, 1]
+                ra = topology.shape_size[sa][0]
+                rb = topology.shape_size[sb][0]
+                half = topology.shape_size[sb][1]
+                centre = wp.transform_get_translation(shape_pose(topology, bodies, env, sa))
+                capsule = shape_pose(topology, bodies, env, sb)
+                axis = z_axis(capsule)
+                p = centre - wp.transform_get_translation(capsule)
+                out = outside_segment(p, axis, half)
+                distance = wp.length(out)
+                n = direction(out, distance, real(MEETS) * rb, perpendicular(axis))  # from the capsule to the sphere
+                gap = distance - ra - rb
+                u = shape_velocity(topology, bodies, bodies.velocity, env, sa, centre)
+                closing = h * (u - shape_velocity(topology, bodies, bodies.velocity, env, sb, centre))
+                move = shift(topology, bodies, env, sa, centre, h) - shift(topology, bodies, env, sb, centre - p, h)
+                ahead = outside_segment(p + move, wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), axis), half)
+                b = bend(gap, distance, n, closing, wp.length(ahead), ahead)
+                write_bent(slots, env, topology.pair_slots[pair], centre - n * (ra + real(0.5) * gap), -n, gap, b, 0)
 
     @wp.func
     def beside_box(slots: Slots, env: int, slot: int, box: transform, size: vec3, c: vec3, e: vec3, half: real, r: real, motion: Motion):
@@ -387,117 +406,130 @@ def make(real) -> dict:
             in_edge(slots, env, slot, box, size, c, e, half, r, normal, axis - 3)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def box_capsule(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
-        start, i = wp.tid()
+    def box_capsule(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + i
-            sa = topology.pairs[pair, 0]
-            sb = topology.pairs[pair, 1]
-            if far_apart(bodies, env, sa, sb):
-                set_apart(topology, slots, env, pair)
-                continue
-            box = shape_pose(topology, bodies, env, sa)
-            capsule = shape_pose(topology, bodies, env, sb)
-            size = topology.shape_size[sa]
-            r = topology.shape_size[sb][0]
-            half = topology.shape_size[sb][1]
-            slot = topology.pair_slots[pair]
-            centre = wp.transform_get_translation(box)
-            middle = wp.transform_get_translation(capsule)
-            near = reach(topology, bodies, env, sa, centre, wp.length(size), h) + reach(topology, bodies, env, sb, middle, half + r, h)
-            if wp.length(middle - centre) < wp.length(size) + half + r + near:
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                sa = topology.pairs[pair, 0]
+                sb = topology.pairs[pair, 1]
+                box = shape_pose(topology, bodies, env, sa)
+                capsule = shape_pose(topology, bodies, env, sb)
+                size = topology.shape_size[sa]
+                r = topology.shape_size[sb][0]
+                half = topology.shape_size[sb][1]
+                slot = topology.pair_slots[pair]
+                centre = wp.transform_get_translation(box)
+                middle = wp.transform_get_translation(capsule)
+                near = reach(topology, bodies, env, sa, centre, wp.length(size), h) + reach(topology, bodies, env, sb, middle, half + r, h)
                 for k in range(3):
                     slots.gap[env, slot + k] = real(NO_POINT)
                 turn = wp.transform_get_rotation(box)
-                axis = z_axis(capsule)
                 c = wp.transform_point(wp.transform_inverse(box), middle)
-                e = wp.quat_rotate_inv(turn, axis)
-                if wp.length(outside_box(c + e * nearest_to_box(c, e, half, size), size)) > real(MEETS) * r:
-                    motion = relative_motion(topology, bodies, env, sa, sb, h)
-                    motion.near = near
-                    move = shift(topology, bodies, env, sb, middle, h) - shift(topology, bodies, env, sa, centre, h)
-                    further = rotation(wp.quat_rotate_inv(turn, shape_turn(topology, bodies, env, sa, h)))
-                    ahead = wp.quat_rotate_inv(further, c + wp.quat_rotate_inv(turn, move))
-                    e_ahead = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), axis)
-                    e_ahead = wp.quat_rotate_inv(further, wp.quat_rotate_inv(turn, e_ahead))
-                    out = outside_box(ahead + e_ahead * nearest_to_box(ahead, e_ahead, half, size), size)
-                    motion.distance = wp.length(out)
-                    motion.normal = wp.quat_rotate(turn, wp.quat_rotate(further, out))
-                    beside_box(slots, env, slot, box, size, c, e, half, r, motion)
-                else:
-                    inside_box(slots, env, slot, box, size, c, e, half, r, near)
-            else:
-                set_apart(topology, slots, env, pair)
+                if wp.length(outside_box(c, size)) < half + r + near:
+                    axis = z_axis(capsule)
+                    e = wp.quat_rotate_inv(turn, axis)
+                    distance = wp.length(outside_box(c + e * nearest_to_box(c, e, half, size), size))
+                    if distance <= real(MEETS) * r:
+                        inside_box(slots, env, slot, box, size, c, e, half, r, near)
+                    elif distance - r < near:
+                        motion = relative_motion(topology, bodies, env, sa, sb, h)
+                        motion.near = near
+                        move = shift(topology, bodies, env, sb, middle, h) - shift(topology, bodies, env, sa, centre, h)
+                        further = rotation(wp.quat_rotate_inv(turn, shape_turn(topology, bodies, env, sa, h)))
+                        ahead = wp.quat_rotate_inv(further, c + wp.quat_rotate_inv(turn, move))
+                        e_ahead = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), axis)
+                        e_ahead = wp.quat_rotate_inv(further, wp.quat_rotate_inv(turn, e_ahead))
+                        out = outside_box(ahead + e_ahead * nearest_to_box(ahead, e_ahead, half, size), size)
+                        motion.distance = wp.length(out)
+                        motion.normal = wp.quat_rotate(turn, wp.quat_rotate(further, out))
+                        beside_box(slots, env, slot, box, size, c, e, half, r, motion)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def capsule_capsule(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
-        start, i = wp.tid()
+    def capsule_capsule(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + i
-            sa = topology.pairs[pair, 0]
-            sb = topology.pairs[pair, 1]
-            if far_apart(bodies, env, sa, sb):
-                set_apart(topology, slots, env, pair)
-                continue
-            a = shape_pose(topology, bodies, env, sa)
-            b = shape_pose(topology, bodies, env, sb)
-            ra = topology.shape_size[sa][0]
-            la = topology.shape_size[sa][1]
-            rb = topology.shape_size[sb][0]
-            lb = topology.shape_size[sb][1]
-            slot = topology.pair_slots[pair]
-            origin = wp.transform_get_translation(a)
-            middle = wp.transform_get_translation(b)
-            d = middle - origin
-            near = reach(topology, bodies, env, sa, origin, la + ra, h) + reach(topology, bodies, env, sb, middle, lb + rb, h)
-            if wp.length(d) < la + ra + lb + rb + near:
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                sa = topology.pairs[pair, 0]
+                sb = topology.pairs[pair, 1]
+                a = shape_pose(topology, bodies, env, sa)
+                b = shape_pose(topology, bodies, env, sb)
+                ra = topology.shape_size[sa][0]
+                la = topology.shape_size[sa][1]
+                rb = topology.shape_size[sb][0]
+                lb = topology.shape_size[sb][1]
+                slot = topology.pair_slots[pair]
+                origin = wp.transform_get_translation(a)
+                middle = wp.transform_get_translation(b)
+                d = middle - origin
+                near = reach(topology, bodies, env, sa, origin, la + ra, h) + reach(topology, bodies, env, sb, middle, lb + rb, h)
                 for k in range(3):
                     slots.gap[env, slot + k] = real(NO_POINT)
                 ea = z_axis(a)
                 eb = z_axis(b)
-                motion = relative_motion(topology, bodies, env, sa, sb, h)
-                motion.near = near
-                ahead = d + shift(topology, bodies, env, sb, middle, h) - shift(topology, bodies, env, sa, origin, h)
-                ea_ahead = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sa, h)), ea)
-                eb_ahead = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), eb)
-                nearest_ahead = ahead + eb_ahead * nearest_to_segment(ahead, eb_ahead, lb, ea_ahead, la)
-                motion.normal = outside_segment(nearest_ahead, ea_ahead, la)
-                motion.distance = wp.length(motion.normal)
-
                 nearest = d + eb * nearest_to_segment(d, eb, lb, ea, la)
                 out = outside_segment(nearest, ea, la)
                 distance = wp.length(out)
-                # Segments that meet part across both, or where they are parallel, across one.
-                least = real(MEETS) * rb
-                across = perpendicular(ea)
-                if wp.length(wp.cross(ea, eb)) > real(1.0e-3):
-                    across = wp.normalize(wp.cross(ea, eb))
-                if wp.dot(across, d) < real(0.0):
-                    across = -across
-                s = cut(whole(lb), wp.dot(d, ea), wp.dot(eb, ea), lb, la, 0, real(ALONG) * rb)
-                if s.low > s.high:
-                    s = whole(lb)
-                low = wp.length(outside_segment(d + s.low * eb, ea, la))
-                high = wp.length(outside_segment(d + s.high * eb, ea, la))
-                covered = wp.min(low, high) <= distance + real(covered_part) * rb
-                if not covered:
-                    n = direction(out, distance, least, across)
-                    write_near(slots, env, slot + 2, motion, origin + nearest, n, distance, ra + rb, rb, 0)
-                for j in range(2):
-                    at = s.low
-                    end = s.low_end
-                    if j == 1:
-                        at = s.high
-                        end = s.high_end
-                    # Where the nearest point lies at the end of a that ends the stretch it stands for that end.
-                    twice = end > 0 and not covered and real(2 * end - 3) * wp.dot(nearest, ea) >= la
-                    if not twice:
-                        p = d + at * eb
-                        apart = outside_segment(p, ea, la)
-                        n = direction(apart, wp.length(apart), least, across)
-                        write_near(slots, env, slot + j, motion, origin + p, n, wp.length(apart), ra + rb, rb, end)
-            else:
-                set_apart(topology, slots, env, pair)
+                if distance - (ra + rb) < near:
+                    motion = relative_motion(topology, bodies, env, sa, sb, h)
+                    motion.near = near
+                    ahead = d + shift(topology, bodies, env, sb, middle, h) - shift(topology, bodies, env, sa, origin, h)
+                    ea_ahead = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sa, h)), ea)
+                    eb_ahead = wp.quat_rotate(rotation(shape_turn(topology, bodies, env, sb, h)), eb)
+                    nearest_ahead = ahead + eb_ahead * nearest_to_segment(ahead, eb_ahead, lb, ea_ahead, la)
+                    motion.normal = outside_segment(nearest_ahead, ea_ahead, la)
+                    motion.distance = wp.length(motion.normal)
+
+                    # Segments that meet part across both, or where they are parallel, across one.
+                    least = real(MEETS) * rb
+                    across = perpendicular(ea)
+                    if wp.length(wp.cross(ea, eb)) > real(1.0e-3):
+                        across = wp.normalize(wp.cross(ea, eb))
+                    if wp.dot(across, d) < real(0.0):
+                        across = -across
+                    s = cut(whole(lb), wp.dot(d, ea), wp.dot(eb, ea), lb, la, 0, real(ALONG) * rb)
+                    if s.low > s.high:
+                        s = whole(lb)
+                    low = wp.length(outside_segment(d + s.low * eb, ea, la))
+                    high = wp.length(outside_segment(d + s.high * eb, ea, la))
+                    covered = wp.min(low, high) <= distance + real(covered_part) * rb
+                    if not covered:
+                        n = direction(out, distance, least, across)
+                        write_near(slots, env, slot + 2, motion, origin + nearest, n, distance, ra + rb, rb, 0)
+                    for j in range(2):
+                        at = s.low
+                        end = s.low_end
+                        if j == 1:
+                            at = s.high
+                            end = s.high_end
+                        # Where the nearest point lies at the end of a that ends the stretch it stands for that end.
+                        twice = end > 0 and not covered and real(2 * end - 3) * wp.dot(nearest, ea) >= la
+                        if not twice:
+                            p = d + at * eb
+                            apart = outside_segment(p, ea, la)
+                            n = direction(apart, wp.length(apart), least, across)
+                            write_near(slots, env, slot + j, motion, origin + p, n, wp.length(apart), ra + rb, rb, end)
 
     return {
         ("PLANE", "CAPSULE"): plane_capsule,

@@ -3,7 +3,11 @@
 
 Every pair owns a fixed range of contact slots. A slot gets a point half-way across the gap, the unit normal from
 shape a to shape b, the gap (negative = penetration) and a feature number that stays the same while the same corner,
-edge or face touches. A slot without a point gets the gap NO_POINT; of a pair that is far apart the first slot gets FAR_PAIR.
+edge or face touches. A slot without a point gets the gap NO_POINT.
+
+Kernels of pairs walk over those that their bounds do not tell apart. They stand in `listed` [E, K + 1 + P], of P pairs of K kinds: first
+where those of each kind start in the row and where the last ends, then the pairs, in order. Kinds with planes, before all others, are there
+as a whole.
 """
 
 import functools
@@ -14,8 +18,6 @@ import warp as wp
 from .types import OPTIONS, scalar_types
 
 NO_POINT = wp.constant(1.0e30)
-# Gap of the first slot of a pair of which no slot has a point or a history: nothing else of it needs to be read.
-FAR_PAIR = wp.constant(2.0e30)
 # Cosine: directions from faces of a box that are square to each other, rotated to world axes, agree by less than this.
 SQUARE = wp.constant(1.0e-6)
 # Of the distance: shapes that overlap by less ahead do not meet, as what rests on both and sinks in does not.
@@ -58,43 +60,66 @@ def pair_functions(real) -> SimpleNamespace:
         return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
 
     @wp.func
-    def far_apart(bodies: Bodies, env: int, a: int, b: int) -> bool:
+    def far_apart(a: vec4, b: vec4) -> bool:
         """Are two shapes further apart than ``reach`` allows for, by their bounds? Not all that are are found."""
-        ball_a = bodies.bounds[env, a]
-        ball_b = bodies.bounds[env, b]
-        d = vec3(ball_b[0] - ball_a[0], ball_b[1] - ball_a[1], ball_b[2] - ball_a[2])
-        far = ball_a[3] + ball_b[3]
+        d = vec3(b[0] - a[0], b[1] - a[1], b[2] - a[2])
+        far = a[3] + b[3]
         return wp.length_sq(d) >= far * far
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def bounds(topology: Topology, bodies: Bodies, h: real, stride: int):
+    def bounds(topology: Topology, bodies: Bodies, h: real, lanes: int, stride: int):
         """Centre of every shape, and at least its radius + ``reach``, without a root; of the world's once."""
-        start, shape = wp.tid()
+        start, lane = wp.tid()
         for env in range(start, bodies.bounds.shape[0], stride):
-            body = topology.shape_body[shape]
-            if body < 0 and bodies.bounds[env, shape][3] > real(0.0):
-                continue
-            radius = sum_norm(topology.shape_size[shape])
-            centre = wp.transform_get_translation(topology.shape_pose[shape])
-            far = real(1.02) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
-            if body >= 0:
-                centre = wp.transform_point(bodies.pose[env, body], centre)
-                twist = bodies.free_velocity[env, body]
-                lever = radius + sum_norm(centre - bodies.com[env, body])
-                far += real(2.0) * h * (sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
-                if bodies.alert.shape[0] > 0:
-                    far += real(2.0) * h * bodies.alert[env]
-            bodies.bounds[env, shape] = vec4(centre[0], centre[1], centre[2], far)
+            for shape in range(lane, bodies.bounds.shape[1], lanes):
+                body = topology.shape_body[shape]
+                if body < 0 and bodies.bounds[env, shape][3] > real(0.0):
+                    continue
+                radius = sum_norm(topology.shape_size[shape])
+                centre = wp.transform_get_translation(topology.shape_pose[shape])
+                far = real(1.02) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
+                if body >= 0:
+                    centre = wp.transform_point(bodies.pose[env, body], centre)
+                    twist = bodies.free_velocity[env, body]
+                    lever = radius + sum_norm(centre - bodies.com[env, body])
+                    far += real(2.0) * h * (sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
+                    if bodies.alert.shape[0] > 0:
+                        far += real(2.0) * h * bodies.alert[env]
+                bodies.bounds[env, shape] = vec4(centre[0], centre[1], centre[2], far)
 
-    @wp.func
-    def set_apart(topology: Topology, slots: Slots, env: int, pair: int):
-        """A pair that is far apart has neither points nor history; it is written when it gets there, not as long as it stays."""
-        first = topology.pair_slots[pair]
-        if slots.gap[env, first] != real(FAR_PAIR):
-            for slot in range(first, topology.pair_slots[pair + 1]):
-                slots.gap[env, slot] = real(NO_POINT)
-                slots.last_feature[env, slot] = -1
-            slots.gap[env, first] = real(FAR_PAIR)
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def list_pairs(
+        pairs: wp.array2d(dtype=int),
+        pair_slots: wp.array(dtype=int),
+        kind_pairs: wp.array(dtype=int),
+        first: int,
+        bounds: wp.array2d(dtype=vec4),
+        gap: wp.array2d(dtype=real),
+        last_feature: wp.array2d(dtype=int),
+        listed: wp.array2d(dtype=int),
+        stride: int,
+    ):
+        """Pairs that are not far apart, of the kinds from `first` on; pairs kind_pairs[k] ... kind_pairs[k + 1] - 1 are of kind k.
+
+        A pair that leaves the list loses its points and its history then; as long as it stays away nothing but its bounds is looked at.
+        """
+        start, _ = wp.tid()
+        kinds = kind_pairs.shape[0] - 1
+        for env in range(start, listed.shape[0], stride):
+            end = listed[env, first]
+            for index in range(end, listed[env, kinds]):
+                pair = listed[env, index]
+                if far_apart(bounds[env, pairs[pair, 0]], bounds[env, pairs[pair, 1]]):
+                    for slot in range(pair_slots[pair], pair_slots[pair + 1]):
+                        gap[env, slot] = real(NO_POINT)
+                        last_feature[env, slot] = -1
+            for kind in range(first, kinds):
+                listed[env, kind] = end
+                for pair in range(kind_pairs[kind], kind_pairs[kind + 1]):
+                    if not far_apart(bounds[env, pairs[pair, 0]], bounds[env, pairs[pair, 1]]):
+                        listed[env, end] = pair
+                        end += 1
+            listed[env, kinds] = end
 
     @wp.func
     def shape_velocity(
@@ -195,9 +220,8 @@ def pair_functions(real) -> SimpleNamespace:
     return SimpleNamespace(
         shape_pose=shape_pose,
         reach=reach,
-        far_apart=far_apart,
         bounds=bounds,
-        set_apart=set_apart,
+        list_pairs=list_pairs,
         shape_velocity=shape_velocity,
         shape_turn=shape_turn,
         shape_motion=shape_motion,
@@ -212,134 +236,171 @@ def pair_functions(real) -> SimpleNamespace:
 
 @functools.cache
 def make(real) -> dict:
-    """Kernels by the names of the two shape types; launch with dim (E, pairs of that kind).
+    """Kernels by the names of the two shape types; launch with dim (E, lanes).
 
-    ``first`` is the first pair of the kind; kinds that leave out far points look ahead by ``h``.
+    ``kind`` numbers the kinds of pairs; those that leave out far points look ahead by ``h``.
     """
     t = scalar_types(real)
     vec3 = t.vec3
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f = pair_functions(real)
     shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
-    far_apart, set_apart = f.far_apart, f.set_apart
     outside_box, bend, shape_turn, rotation, shift = f.outside_box, f.bend, f.shape_turn, f.rotation, f.shift
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def plane_sphere(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
-        start, i = wp.tid()
+    def plane_sphere(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + i
-            plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
-            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
-            radius = topology.shape_size[topology.pairs[pair, 1]][0]
-            normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
-            gap = wp.dot(normal, centre - wp.transform_get_translation(plane)) - radius
-            point = centre - normal * (radius + real(0.5) * gap)
-            write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
+                centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
+                radius = topology.shape_size[topology.pairs[pair, 1]][0]
+                normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
+                gap = wp.dot(normal, centre - wp.transform_get_translation(plane)) - radius
+                point = centre - normal * (radius + real(0.5) * gap)
+                write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def plane_box(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
-        start, i = wp.tid()
+    def plane_box(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + i
-            plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
-            box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
-            size = topology.shape_size[topology.pairs[pair, 1]]
-            normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
-            origin = wp.transform_get_translation(plane)
-            centre = wp.transform_get_translation(box)
-            radius = wp.length(size)
-            # A corner further away than this gets no row; most have none, so they get no point either.
-            near = reach(topology, bodies, env, topology.pairs[pair, 0], centre, radius, h)
-            near += reach(topology, bodies, env, topology.pairs[pair, 1], centre, radius, h)
-            turn = wp.quat_to_matrix(wp.transform_get_rotation(box))
-            slot = topology.pair_slots[pair]
-            above = wp.dot(normal, centre - origin)
-            rise = wp.cw_mul(normal * turn, size)  # of a corner over the centre, along each axis of the box
-            for k in range(8):
-                side = vec3(real(-1.0), real(-1.0), real(-1.0))
-                for axis in range(3):
-                    if (k & (1 << axis)) != 0:
-                        side[axis] = real(1.0)
-                gap = above + side[0] * rise[0] + side[1] * rise[1] + side[2] * rise[2]
-                if gap < near:
-                    vertex = centre + turn * wp.cw_mul(side, size)
-                    write(slots, env, slot + k, vertex - normal * (real(0.5) * gap), normal, gap, k)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
+                box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
+                size = topology.shape_size[topology.pairs[pair, 1]]
+                normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
+                origin = wp.transform_get_translation(plane)
+                centre = wp.transform_get_translation(box)
+                radius = wp.length(size)
+                # A corner further away than this gets no row; most have none, so they get no point either.
+                near = reach(topology, bodies, env, topology.pairs[pair, 0], centre, radius, h)
+                near += reach(topology, bodies, env, topology.pairs[pair, 1], centre, radius, h)
+                turn = wp.quat_to_matrix(wp.transform_get_rotation(box))
+                slot = topology.pair_slots[pair]
+                above = wp.dot(normal, centre - origin)
+                rise = wp.cw_mul(normal * turn, size)  # of a corner over the centre, along each axis of the box
+                for k in range(8):
+                    side = vec3(real(-1.0), real(-1.0), real(-1.0))
+                    for axis in range(3):
+                        if (k & (1 << axis)) != 0:
+                            side[axis] = real(1.0)
+                    gap = above + side[0] * rise[0] + side[1] * rise[1] + side[2] * rise[2]
+                    if gap < near:
+                        vertex = centre + turn * wp.cw_mul(side, size)
+                        write(slots, env, slot + k, vertex - normal * (real(0.5) * gap), normal, gap, k)
+                    else:
+                        slots.gap[env, slot + k] = real(NO_POINT)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def sphere_sphere(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                ra = topology.shape_size[topology.pairs[pair, 0]][0]
+                rb = topology.shape_size[topology.pairs[pair, 1]][0]
+                a = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
+                b = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
+                offset = b - a
+                distance = wp.length(offset)
+                normal = vec3(real(0.0), real(0.0), real(1.0))  # concentric spheres have none: any will part them
+                if distance > real(0.0):
+                    normal = offset / distance
+                gap = distance - ra - rb
+                u = shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 1], b)
+                u -= shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 0], a)
+                ahead = offset + shift(topology, bodies, env, topology.pairs[pair, 1], b, h)
+                ahead -= shift(topology, bodies, env, topology.pairs[pair, 0], a, h)
+                left = bend(gap, distance, normal, h * u, wp.length(ahead), ahead)
+                write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, left, 0)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def sphere_box(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                radius = topology.shape_size[topology.pairs[pair, 0]][0]
+                size = topology.shape_size[topology.pairs[pair, 1]]
+                centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
+                box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
+                local = wp.transform_point(wp.transform_inverse(box), centre)
+                inward = -outside_box(local, size)
+                nearest = local + inward
+                distance = wp.length(inward)
+                if distance > real(0.0):
+                    inward = inward / distance
                 else:
-                    slots.gap[env, slot + k] = real(NO_POINT)
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def sphere_sphere(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
-        start, i = wp.tid()
-        for env in range(start, slots.gap.shape[0], stride):
-            pair = first + i
-            if far_apart(bodies, env, topology.pairs[pair, 0], topology.pairs[pair, 1]):
-                set_apart(topology, slots, env, pair)
-                continue
-            ra = topology.shape_size[topology.pairs[pair, 0]][0]
-            rb = topology.shape_size[topology.pairs[pair, 1]][0]
-            a = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
-            b = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 1]))
-            offset = b - a
-            distance = wp.length(offset)
-            normal = vec3(real(0.0), real(0.0), real(1.0))  # concentric spheres have none: any will part them
-            if distance > real(0.0):
-                normal = offset / distance
-            gap = distance - ra - rb
-            u = shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 1], b)
-            u -= shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 0], a)
-            ahead = offset + shift(topology, bodies, env, topology.pairs[pair, 1], b, h)
-            ahead -= shift(topology, bodies, env, topology.pairs[pair, 0], a, h)
-            left = bend(gap, distance, normal, h * u, wp.length(ahead), ahead)
-            write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, left, 0)
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def sphere_box(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, stride: int):
-        start, i = wp.tid()
-        for env in range(start, slots.gap.shape[0], stride):
-            pair = first + i
-            if far_apart(bodies, env, topology.pairs[pair, 0], topology.pairs[pair, 1]):
-                set_apart(topology, slots, env, pair)
-                continue
-            radius = topology.shape_size[topology.pairs[pair, 0]][0]
-            size = topology.shape_size[topology.pairs[pair, 1]]
-            centre = wp.transform_get_translation(shape_pose(topology, bodies, env, topology.pairs[pair, 0]))
-            box = shape_pose(topology, bodies, env, topology.pairs[pair, 1])
-            local = wp.transform_point(wp.transform_inverse(box), centre)
-            inward = -outside_box(local, size)
-            nearest = local + inward
-            distance = wp.length(inward)
-            if distance > real(0.0):
-                inward = inward / distance
-            else:
-                # The centre is inside: leave through the nearest face.
-                axis = int(0)
-                depth = size[0] - wp.abs(local[0])
-                for k in range(1, 3):
-                    d = size[k] - wp.abs(local[k])
-                    if d < depth:
-                        depth = d
-                        axis = k
-                side = real(1.0)
-                if local[axis] < real(0.0):
-                    side = real(-1.0)
-                inward = vec3()
-                inward[axis] = -side
-                nearest[axis] = side * size[axis]
-                distance = -depth
-            normal = wp.transform_vector(box, inward)
-            gap = distance - radius
-            point = wp.transform_point(box, nearest) - normal * (real(0.5) * gap)
-            turn = wp.transform_get_rotation(box)
-            u = shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 0], centre)
-            closing = h * (u - shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 1], centre))
-            # In the axes of the box, which turn as well.
-            move = shift(topology, bodies, env, topology.pairs[pair, 0], centre, h)
-            move -= shift(topology, bodies, env, topology.pairs[pair, 1], wp.transform_get_translation(box), h)
-            further = rotation(wp.quat_rotate_inv(turn, shape_turn(topology, bodies, env, topology.pairs[pair, 1], h)))
-            ahead = outside_box(wp.quat_rotate_inv(further, local + wp.quat_rotate_inv(turn, move)), size)
-            left = bend(gap, distance, -normal, closing, wp.length(ahead), wp.quat_rotate(turn, wp.quat_rotate(further, ahead)))
-            write_bent(slots, env, topology.pair_slots[pair], point, normal, gap, left, 0)
+                    # The centre is inside: leave through the nearest face.
+                    axis = int(0)
+                    depth = size[0] - wp.abs(local[0])
+                    for k in range(1, 3):
+                        d = size[k] - wp.abs(local[k])
+                        if d < depth:
+                            depth = d
+                            axis = k
+                    side = real(1.0)
+                    if local[axis] < real(0.0):
+                        side = real(-1.0)
+                    inward = vec3()
+                    inward[axis] = -side
+                    nearest[axis] = side * size[axis]
+                    distance = -depth
+                normal = wp.transform_vector(box, inward)
+                gap = distance - radius
+                point = wp.transform_point(box, nearest) - normal * (real(0.5) * gap)
+                turn = wp.transform_get_rotation(box)
+                u = shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 0], centre)
+                closing = h * (u - shape_velocity(topology, bodies, bodies.velocity, env, topology.pairs[pair, 1], centre))
+                # In the axes of the box, which turn as well.
+                move = shift(topology, bodies, env, topology.pairs[pair, 0], centre, h)
+                move -= shift(topology, bodies, env, topology.pairs[pair, 1], wp.transform_get_translation(box), h)
+                further = rotation(wp.quat_rotate_inv(turn, shape_turn(topology, bodies, env, topology.pairs[pair, 1], h)))
+                ahead = outside_box(wp.quat_rotate_inv(further, local + wp.quat_rotate_inv(turn, move)), size)
+                left = bend(gap, distance, -normal, closing, wp.length(ahead), wp.quat_rotate(turn, wp.quat_rotate(further, ahead)))
+                write_bent(slots, env, topology.pair_slots[pair], point, normal, gap, left, 0)
 
     return {
         ("PLANE", "SPHERE"): plane_sphere,

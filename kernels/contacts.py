@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import rigid, tree
-from .collide import FAR_PAIR, NO_POINT, pair_functions
+from .collide import NO_POINT, pair_functions
 from .types import CONE, DISC, FACETS, MAX, MIN, MULTIPLY, OPTIONS, OVERFLOW, REGULARIZED, scalar_types
 
 # Overlaps that no load explains are pushed apart no faster than this [m/s], whatever the stiffness; what turns comes on top.
@@ -427,6 +427,7 @@ def make(real, trees: bool = False) -> SimpleNamespace:
     def select(
         topology: Topology,
         bodies: Bodies,
+        listed: wp.array2d(dtype=int),
         slots: Slots,
         env: int,
         h: real,
@@ -442,17 +443,16 @@ def make(real, trees: bool = False) -> SimpleNamespace:
                 bodies.hit[env, b] = real(0.0)
         alert = real(0.0)
         count = int(0)
-        for pair in range(topology.pairs.shape[0]):
-            first = topology.pair_slots[pair]
-            if slots.gap[env, first] == real(FAR_PAIR):
-                continue
+        kinds = listed.shape[1] - 1 - topology.pairs.shape[0]
+        for index in range(listed[env, 0], listed[env, kinds]):
+            pair = listed[env, index]
             body = topology.pair_body[pair]
             hit = real(0.0)
             if again:
                 for side in range(2):
                     if body[side] >= 0:
                         hit += bodies.hit[env, body[side]]
-            for slot in range(first, topology.pair_slots[pair + 1]):
+            for slot in range(topology.pair_slots[pair], topology.pair_slots[pair + 1]):
                 phi = slots.gap[env, slot]
                 selected = bool(False)
                 if phi < real(NO_POINT):
@@ -487,7 +487,7 @@ def make(real, trees: bool = False) -> SimpleNamespace:
         return count
 
     @wp.func
-    def hand_on(topology: Topology, bodies: Bodies, slots: Slots, env: int, h: real) -> bool:
+    def hand_on(topology: Topology, bodies: Bodies, listed: wp.array2d(dtype=int), slots: Slots, env: int, h: real) -> bool:
         """What a hit body may hit in turn within the step, up and down the pairs until nothing changes. Is there a hit at all?"""
         news = bool(False)
         for b in range(bodies.hit.shape[1]):
@@ -495,18 +495,19 @@ def make(real, trees: bool = False) -> SimpleNamespace:
                 news = True
         any_hit = news
         down = bool(False)
-        pairs = topology.pairs.shape[0]
+        first = listed[env, 0]
+        last = listed[env, listed.shape[1] - 1 - topology.pairs.shape[0]] - 1
         while news:
             news = bool(False)
-            for k in range(pairs):
-                pair = k
+            for k in range(first, last + 1):
+                pair = listed[env, k]
                 if down:
-                    pair = pairs - 1 - k
+                    pair = listed[env, first + last - k]
                 body = topology.pair_body[pair]
                 if body[0] >= 0 and body[1] >= 0:
                     fastest = wp.max(bodies.hit[env, body[0]], bodies.hit[env, body[1]])
                     closes = bool(False)
-                    if fastest > real(0.0) and slots.gap[env, topology.pair_slots[pair]] != real(FAR_PAIR):
+                    if fastest > real(0.0):
                         for slot in range(topology.pair_slots[pair], topology.pair_slots[pair + 1]):
                             closes = closes or slots.gap[env, slot] < h * fastest
                     if closes:
@@ -523,6 +524,7 @@ def make(real, trees: bool = False) -> SimpleNamespace:
         topology: Topology,
         parameters: Parameters,
         bodies: Bodies,
+        listed: wp.array2d(dtype=int),
         slots: Slots,
         h: real,
         contacts: Contacts,
@@ -538,9 +540,9 @@ def make(real, trees: bool = False) -> SimpleNamespace:
         start, _ = wp.tid()
         for env in range(start, contacts.count.shape[0], stride):
             fall = h * h * wp.length(parameters.gravity[env % parameters.gravity.shape[0]]) + real(1.0e-9)
-            count = select(topology, bodies, slots, env, h, fall, False, contacts, status)
-            if hand_on(topology, bodies, slots, env, h):
-                count = select(topology, bodies, slots, env, h, fall, True, contacts, status)
+            count = select(topology, bodies, listed, slots, env, h, fall, False, contacts, status)
+            if hand_on(topology, bodies, listed, slots, env, h):
+                count = select(topology, bodies, listed, slots, env, h, fall, True, contacts, status)
             contacts.count[env] = count
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)

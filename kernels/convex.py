@@ -331,105 +331,119 @@ def meeting(real):
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """Kernels ``sharp`` (cylinders, cones, hulls and boxes with each other) and ``on_plane``; launch with dim (E, pairs of a kind)."""
+    """Kernels ``sharp`` (cylinders, cones, hulls and boxes with each other) and ``on_plane``; launch with dim (E, lanes)."""
     t = scalar_types(real)
     vec3 = t.vec3
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, a, s, meet = pair_functions(real), axes(real), functions(real), meeting(real)
-    shape_pose, reach, shape_velocity, write, far_apart, set_apart = (
-        f.shape_pose,
-        f.reach,
-        f.shape_velocity,
-        f.write,
-        f.far_apart,
-        f.set_apart,
-    )
+    shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
     inverse_mass, touching_depth, Hulls, ring_point, turned = a.inverse_mass, a.touching_depth, s.Hulls, s.ring_point, s.turned
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def sharp(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int):
-        start, index = wp.tid()
+    def sharp(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        hulls: Hulls,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + index
-            sa = topology.pairs[pair, 0]
-            sb = topology.pairs[pair, 1]
-            if far_apart(bodies, env, sa, sb):
-                set_apart(topology, slots, env, pair)
-                continue
-            xa = shape_pose(topology, bodies, env, sa)
-            xb = shape_pose(topology, bodies, env, sb)
-            u = shape_velocity(topology, bodies, bodies.velocity, env, sb, wp.transform_get_translation(xb))
-            u -= shape_velocity(topology, bodies, bodies.velocity, env, sa, wp.transform_get_translation(xa))
-            inverse_a = inverse_mass(topology, bodies, env, sa)
-            inverse_b = inverse_mass(topology, bodies, env, sb)
-            gravity = parameters.gravity[env % parameters.gravity.shape[0]]
-            stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
-            # Levers are those of the lighter shape, which turns more easily.
-            share = real(0.5)
-            if inverse_a + inverse_b > real(0.0):
-                share = inverse_b / (inverse_a + inverse_b)
-            normal = wp.zeros(shape=(1,), dtype=vec3)
-            at = wp.zeros(shape=(POINTS,), dtype=vec3)
-            gaps = wp.zeros(shape=(POINTS,), dtype=real)
-            features = wp.zeros(shape=(POINTS,), dtype=int)
-            count = meet(
-                hulls,
-                sa,
-                sb,
-                topology.shape_size[sa],
-                topology.shape_size[sb],
-                xa,
-                xb,
-                h * u,
-                touching_depth(gravity, inverse_a, inverse_b, stiffness),
-                share,
-                normal,
-                at,
-                gaps,
-                features,
-            )
-            slot = topology.pair_slots[pair]
-            for k in range(count):
-                write(slots, env, slot + k, at[k], normal[0], gaps[k], features[k])
-            for k in range(count, POINTS):
-                slots.gap[env, slot + k] = real(NO_POINT)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                sa = topology.pairs[pair, 0]
+                sb = topology.pairs[pair, 1]
+                xa = shape_pose(topology, bodies, env, sa)
+                xb = shape_pose(topology, bodies, env, sb)
+                u = shape_velocity(topology, bodies, bodies.velocity, env, sb, wp.transform_get_translation(xb))
+                u -= shape_velocity(topology, bodies, bodies.velocity, env, sa, wp.transform_get_translation(xa))
+                inverse_a = inverse_mass(topology, bodies, env, sa)
+                inverse_b = inverse_mass(topology, bodies, env, sb)
+                gravity = parameters.gravity[env % parameters.gravity.shape[0]]
+                stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
+                # Levers are those of the lighter shape, which turns more easily.
+                share = real(0.5)
+                if inverse_a + inverse_b > real(0.0):
+                    share = inverse_b / (inverse_a + inverse_b)
+                normal = wp.zeros(shape=(1,), dtype=vec3)
+                at = wp.zeros(shape=(POINTS,), dtype=vec3)
+                gaps = wp.zeros(shape=(POINTS,), dtype=real)
+                features = wp.zeros(shape=(POINTS,), dtype=int)
+                count = meet(
+                    hulls,
+                    sa,
+                    sb,
+                    topology.shape_size[sa],
+                    topology.shape_size[sb],
+                    xa,
+                    xb,
+                    h * u,
+                    touching_depth(gravity, inverse_a, inverse_b, stiffness),
+                    share,
+                    normal,
+                    at,
+                    gaps,
+                    features,
+                )
+                slot = topology.pair_slots[pair]
+                for k in range(count):
+                    write(slots, env, slot + k, at[k], normal[0], gaps[k], features[k])
+                for k in range(count, POINTS):
+                    slots.gap[env, slot + k] = real(NO_POINT)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def on_plane(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int):
-        start, index = wp.tid()
+    def on_plane(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        hulls: Hulls,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + index
-            shape = topology.pairs[pair, 1]
-            plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
-            pose = shape_pose(topology, bodies, env, shape)
-            size = topology.shape_size[shape]
-            normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
-            origin = wp.transform_get_translation(plane)
-            centre = wp.transform_get_translation(pose)
-            radius = wp.length(size)
-            near = reach(topology, bodies, env, topology.pairs[pair, 0], centre, radius, h)
-            near += reach(topology, bodies, env, shape, centre, radius, h)
-            turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
-            down = -(wp.transpose(turn) * normal)
-            above = wp.dot(normal, centre - origin)
-            slot = topology.pair_slots[pair]
-            kind = hulls.kind[shape]
-            number = topology.pair_slots[pair + 1] - slot
-            for k in range(number):
-                p = vec3()
-                if turned(kind):
-                    z = -size[1]
-                    if k >= RING:
-                        z = size[1]
-                    p = ring_point(size[0], z, down, k % RING, RING)
-                    if kind == CONE and k == RING:
-                        p = vec3(real(0.0), real(0.0), z)
-                else:
-                    p = hulls.point[hulls.first_point[shape] + k]
-                gap = above - wp.dot(down, p)
-                if gap < near:
-                    write(slots, env, slot + k, centre + turn * p - normal * (real(0.5) * gap), normal, gap, k)
-                else:
-                    slots.gap[env, slot + k] = real(NO_POINT)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                shape = topology.pairs[pair, 1]
+                plane = shape_pose(topology, bodies, env, topology.pairs[pair, 0])
+                pose = shape_pose(topology, bodies, env, shape)
+                size = topology.shape_size[shape]
+                normal = wp.transform_vector(plane, vec3(real(0.0), real(0.0), real(1.0)))
+                origin = wp.transform_get_translation(plane)
+                centre = wp.transform_get_translation(pose)
+                radius = wp.length(size)
+                near = reach(topology, bodies, env, topology.pairs[pair, 0], centre, radius, h)
+                near += reach(topology, bodies, env, shape, centre, radius, h)
+                turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+                down = -(wp.transpose(turn) * normal)
+                above = wp.dot(normal, centre - origin)
+                slot = topology.pair_slots[pair]
+                kind = hulls.kind[shape]
+                number = topology.pair_slots[pair + 1] - slot
+                for k in range(number):
+                    p = vec3()
+                    if turned(kind):
+                        z = -size[1]
+                        if k >= RING:
+                            z = size[1]
+                        p = ring_point(size[0], z, down, k % RING, RING)
+                        if kind == CONE and k == RING:
+                            p = vec3(real(0.0), real(0.0), z)
+                    else:
+                        p = hulls.point[hulls.first_point[shape] + k]
+                    gap = above - wp.dot(down, p)
+                    if gap < near:
+                        write(slots, env, slot + k, centre + turn * p - normal * (real(0.5) * gap), normal, gap, k)
+                    else:
+                        slots.gap[env, slot + k] = real(NO_POINT)
 
     return SimpleNamespace(sharp=sharp, on_plane=on_plane)

@@ -26,14 +26,14 @@ SAME = wp.constant(1.0e-6)
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """Kernels ``sharp_on_mesh`` and ``round_on_mesh``; launch with dim (E, pairs of a kind)."""
+    """Kernels ``sharp_on_mesh`` and ``round_on_mesh``; launch with dim (E, lanes)."""
     t = scalar_types(real)
     vec3, transform = t.vec3, t.transform
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, a, Hulls = pair_functions(real), axes(real), functions(real).Hulls
     shape_pose, reach, shape_velocity, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write_bent
     shape_motion = f.shape_motion
-    far_apart, set_apart, inverse_mass, touching_depth = f.far_apart, f.set_apart, a.inverse_mass, a.touching_depth
+    inverse_mass, touching_depth = a.inverse_mass, a.touching_depth
     meet_sharp, meet_round = convex.meeting(real), rounded.meeting(real)
 
     @wp.func
@@ -124,159 +124,173 @@ def make(real) -> SimpleNamespace:
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def sharp_on_mesh(
-        topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        hulls: Hulls,
+        lanes: int,
+        stride: int,
     ):
-        start, index = wp.tid()
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + index
-            sa = topology.pairs[pair, 0]
-            sb = topology.pairs[pair, 1]
-            if far_apart(bodies, env, sa, sb):
-                set_apart(topology, slots, env, pair)
-                continue
-            size = topology.shape_size[sa]
-            xa = shape_pose(topology, bodies, env, sa)
-            xb = shape_pose(topology, bodies, env, sb)
-            centre = wp.transform_get_translation(xa)
-            around = wp.length(size)
-            near = around + reach(topology, bodies, env, sa, centre, around, h)
-            near += reach(topology, bodies, env, sb, centre, around, h)
-            inverse_a = inverse_mass(topology, bodies, env, sa)
-            gravity = parameters.gravity[env % parameters.gravity.shape[0]]
-            stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
-            deep = touching_depth(gravity, inverse_a, real(0.0), stiffness)
-            u = -shape_velocity(topology, bodies, bodies.velocity, env, sa, centre)
-            u += shape_velocity(topology, bodies, bodies.velocity, env, sb, centre)
-            normals = wp.zeros(shape=(MOST,), dtype=vec3)
-            at = wp.zeros(shape=(MOST,), dtype=vec3)
-            gaps = wp.zeros(shape=(MOST,), dtype=real)
-            bends = wp.zeros(shape=(MOST,), dtype=real)
-            features = wp.zeros(shape=(MOST,), dtype=int)
-            count = int(0)
-            normal = wp.zeros(shape=(1,), dtype=vec3)
-            points = wp.zeros(shape=(convex.POINTS,), dtype=vec3)
-            depths = wp.zeros(shape=(convex.POINTS,), dtype=real)
-            names = wp.zeros(shape=(convex.POINTS,), dtype=int)
-            slot = topology.pair_slots[pair]
-            number = topology.pair_slots[pair + 1] - slot
-            low = bounds_in(xb, centre, near, real(-1.0))
-            high = bounds_in(xb, centre, near, real(1.0))
-            query = wp.mesh_query_aabb(hulls.mesh[sb], low, high)
-            triangle = int(0)
-            while wp.mesh_query_aabb_next(query, triangle):
-                k = hulls.first_piece[sb] + triangle
-                piece = topology.shape_size.shape[0] + k
-                place = wp.transform_multiply(xb, transform(hulls.centre[k], wp.quat_identity(dtype=real)))
-                middle = wp.transform_get_translation(place)
-                away = wp.length(middle - centre)
-                if away > near + hulls.radius[k] or wp.abs(wp.dot(normal_of(hulls, xb, piece), middle - centre)) > near:
-                    continue
-                flat = vec3(hulls.radius[k], real(0.0), real(0.0))
-                found = meet_sharp(hulls, sa, piece, size, flat, xa, place, h * u, deep, real(0.0), normal, points, depths, names)
-                for m in range(found):
-                    if depths[m] < near:
-                        name = ((names[m] % 32749) * 32749 + triangle) & 0x3FFFFFFF
-                        count = collect(
-                            normals,
-                            at,
-                            gaps,
-                            bends,
-                            features,
-                            count,
-                            number,
-                            real(SAME) * around,
-                            normal[0],
-                            points[m],
-                            depths[m],
-                            real(0.0),
-                            name,
-                        )
-            settle(slots, env, slot, number, normals, at, gaps, bends, features, count)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                sa = topology.pairs[pair, 0]
+                sb = topology.pairs[pair, 1]
+                size = topology.shape_size[sa]
+                xa = shape_pose(topology, bodies, env, sa)
+                xb = shape_pose(topology, bodies, env, sb)
+                centre = wp.transform_get_translation(xa)
+                around = wp.length(size)
+                near = around + reach(topology, bodies, env, sa, centre, around, h)
+                near += reach(topology, bodies, env, sb, centre, around, h)
+                inverse_a = inverse_mass(topology, bodies, env, sa)
+                gravity = parameters.gravity[env % parameters.gravity.shape[0]]
+                stiffness = parameters.pair_contact[env % parameters.pair_contact.shape[0], pair][0]
+                deep = touching_depth(gravity, inverse_a, real(0.0), stiffness)
+                u = -shape_velocity(topology, bodies, bodies.velocity, env, sa, centre)
+                u += shape_velocity(topology, bodies, bodies.velocity, env, sb, centre)
+                normals = wp.zeros(shape=(MOST,), dtype=vec3)
+                at = wp.zeros(shape=(MOST,), dtype=vec3)
+                gaps = wp.zeros(shape=(MOST,), dtype=real)
+                bends = wp.zeros(shape=(MOST,), dtype=real)
+                features = wp.zeros(shape=(MOST,), dtype=int)
+                count = int(0)
+                normal = wp.zeros(shape=(1,), dtype=vec3)
+                points = wp.zeros(shape=(convex.POINTS,), dtype=vec3)
+                depths = wp.zeros(shape=(convex.POINTS,), dtype=real)
+                names = wp.zeros(shape=(convex.POINTS,), dtype=int)
+                slot = topology.pair_slots[pair]
+                number = topology.pair_slots[pair + 1] - slot
+                low = bounds_in(xb, centre, near, real(-1.0))
+                high = bounds_in(xb, centre, near, real(1.0))
+                query = wp.mesh_query_aabb(hulls.mesh[sb], low, high)
+                triangle = int(0)
+                while wp.mesh_query_aabb_next(query, triangle):
+                    k = hulls.first_piece[sb] + triangle
+                    piece = topology.shape_size.shape[0] + k
+                    place = wp.transform_multiply(xb, transform(hulls.centre[k], wp.quat_identity(dtype=real)))
+                    middle = wp.transform_get_translation(place)
+                    away = wp.length(middle - centre)
+                    if away > near + hulls.radius[k] or wp.abs(wp.dot(normal_of(hulls, xb, piece), middle - centre)) > near:
+                        continue
+                    flat = vec3(hulls.radius[k], real(0.0), real(0.0))
+                    found = meet_sharp(hulls, sa, piece, size, flat, xa, place, h * u, deep, real(0.0), normal, points, depths, names)
+                    for m in range(found):
+                        if depths[m] < near:
+                            name = ((names[m] % 32749) * 32749 + triangle) & 0x3FFFFFFF
+                            count = collect(
+                                normals,
+                                at,
+                                gaps,
+                                bends,
+                                features,
+                                count,
+                                number,
+                                real(SAME) * around,
+                                normal[0],
+                                points[m],
+                                depths[m],
+                                real(0.0),
+                                name,
+                            )
+                settle(slots, env, slot, number, normals, at, gaps, bends, features, count)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def round_on_mesh(
-        topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        hulls: Hulls,
+        lanes: int,
+        stride: int,
     ):
-        start, index = wp.tid()
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + index
-            sa = topology.pairs[pair, 0]
-            sb = topology.pairs[pair, 1]
-            if far_apart(bodies, env, sa, sb):
-                set_apart(topology, slots, env, pair)
-                continue
-            size = topology.shape_size[sa]
-            slot = topology.pair_slots[pair]
-            number = topology.pair_slots[pair + 1] - slot
-            half = real(0.0)
-            if number > wp.static(SLOTS["SPHERE"]):
-                half = size[1]
-            xa = shape_pose(topology, bodies, env, sa)
-            xb = shape_pose(topology, bodies, env, sb)
-            centre = wp.transform_get_translation(xa)
-            near = size[0] + reach(topology, bodies, env, sa, centre, size[0] + half, h)
-            near += reach(topology, bodies, env, sb, centre, size[0] + half, h)
-            com_a, twist_a = shape_motion(topology, bodies, env, sa)
-            com_b, twist_b = shape_motion(topology, bodies, env, sb)
-            normals = wp.zeros(shape=(MOST,), dtype=vec3)
-            at = wp.zeros(shape=(MOST,), dtype=vec3)
-            gaps = wp.zeros(shape=(MOST,), dtype=real)
-            bends = wp.zeros(shape=(MOST,), dtype=real)
-            features = wp.zeros(shape=(MOST,), dtype=int)
-            count = int(0)
-            outward = wp.zeros(shape=(3,), dtype=vec3)
-            points = wp.zeros(shape=(3,), dtype=vec3)
-            depths = wp.zeros(shape=(3,), dtype=real)
-            curved = wp.zeros(shape=(3,), dtype=real)
-            names = wp.zeros(shape=(3,), dtype=int)
-            low = bounds_in(xb, centre, near + half, real(-1.0))
-            high = bounds_in(xb, centre, near + half, real(1.0))
-            query = wp.mesh_query_aabb(hulls.mesh[sb], low, high)
-            triangle = int(0)
-            while wp.mesh_query_aabb_next(query, triangle):
-                k = hulls.first_piece[sb] + triangle
-                piece = topology.shape_size.shape[0] + k
-                place = wp.transform_multiply(xb, transform(hulls.centre[k], wp.quat_identity(dtype=real)))
-                flat = vec3(hulls.radius[k], real(0.0), real(0.0))
-                meet_round(
-                    hulls,
-                    sa,
-                    piece,
-                    size,
-                    flat,
-                    xa,
-                    place,
-                    com_a,
-                    com_b,
-                    twist_a,
-                    twist_b,
-                    half,
-                    near,
-                    h,
-                    outward,
-                    points,
-                    depths,
-                    curved,
-                    names,
-                )
-                for m in range(3):
-                    if (m == 0 or half > real(0.0)) and depths[m] < near:
-                        name = ((names[m] * 3 + m) * 32749 + triangle) & 0x3FFFFFFF
-                        count = collect(
-                            normals,
-                            at,
-                            gaps,
-                            bends,
-                            features,
-                            count,
-                            number,
-                            real(SAME) * size[0],
-                            outward[m],
-                            points[m],
-                            depths[m],
-                            curved[m],
-                            name,
-                        )
-            settle(slots, env, slot, number, normals, at, gaps, bends, features, count)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                sa = topology.pairs[pair, 0]
+                sb = topology.pairs[pair, 1]
+                size = topology.shape_size[sa]
+                slot = topology.pair_slots[pair]
+                number = topology.pair_slots[pair + 1] - slot
+                half = real(0.0)
+                if number > wp.static(SLOTS["SPHERE"]):
+                    half = size[1]
+                xa = shape_pose(topology, bodies, env, sa)
+                xb = shape_pose(topology, bodies, env, sb)
+                centre = wp.transform_get_translation(xa)
+                near = size[0] + reach(topology, bodies, env, sa, centre, size[0] + half, h)
+                near += reach(topology, bodies, env, sb, centre, size[0] + half, h)
+                com_a, twist_a = shape_motion(topology, bodies, env, sa)
+                com_b, twist_b = shape_motion(topology, bodies, env, sb)
+                normals = wp.zeros(shape=(MOST,), dtype=vec3)
+                at = wp.zeros(shape=(MOST,), dtype=vec3)
+                gaps = wp.zeros(shape=(MOST,), dtype=real)
+                bends = wp.zeros(shape=(MOST,), dtype=real)
+                features = wp.zeros(shape=(MOST,), dtype=int)
+                count = int(0)
+                outward = wp.zeros(shape=(3,), dtype=vec3)
+                points = wp.zeros(shape=(3,), dtype=vec3)
+                depths = wp.zeros(shape=(3,), dtype=real)
+                curved = wp.zeros(shape=(3,), dtype=real)
+                names = wp.zeros(shape=(3,), dtype=int)
+                low = bounds_in(xb, centre, near + half, real(-1.0))
+                high = bounds_in(xb, centre, near + half, real(1.0))
+                query = wp.mesh_query_aabb(hulls.mesh[sb], low, high)
+                triangle = int(0)
+                while wp.mesh_query_aabb_next(query, triangle):
+                    k = hulls.first_piece[sb] + triangle
+                    piece = topology.shape_size.shape[0] + k
+                    place = wp.transform_multiply(xb, transform(hulls.centre[k], wp.quat_identity(dtype=real)))
+                    flat = vec3(hulls.radius[k], real(0.0), real(0.0))
+                    meet_round(
+                        hulls,
+                        sa,
+                        piece,
+                        size,
+                        flat,
+                        xa,
+                        place,
+                        com_a,
+                        com_b,
+                        twist_a,
+                        twist_b,
+                        half,
+                        near,
+                        h,
+                        outward,
+                        points,
+                        depths,
+                        curved,
+                        names,
+                    )
+                    for m in range(3):
+                        if (m == 0 or half > real(0.0)) and depths[m] < near:
+                            name = ((names[m] * 3 + m) * 32749 + triangle) & 0x3FFFFFFF
+                            count = collect(
+                                normals,
+                                at,
+                                gaps,
+                                bends,
+                                features,
+                                count,
+                                number,
+                                real(SAME) * size[0],
+                                outward[m],
+                                points[m],
+                                depths[m],
+                                curved[m],
+                                name,
+                            )
+                settle(slots, env, slot, number, normals, at, gaps, bends, features, count)
 
     return SimpleNamespace(sharp_on_mesh=sharp_on_mesh, round_on_mesh=round_on_mesh)

@@ -341,47 +341,57 @@ def meeting(real):
 
 @functools.cache
 def make(real):
-    """Kernel ``rounded``; launch with dim (E, pairs of a kind)."""
+    """Kernel ``rounded``; launch with dim (E, lanes)."""
     t = scalar_types(real)
     vec3 = t.vec3
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
     f, Hulls, meet = pair_functions(real), functions(real).Hulls, meeting(real)
-    shape_pose, shape_motion, reach = f.shape_pose, f.shape_motion, f.reach
-    write_bent, far_apart, set_apart = f.write_bent, f.far_apart, f.set_apart
+    shape_pose, shape_motion, reach, write_bent = f.shape_pose, f.shape_motion, f.reach, f.write_bent
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def rounded(topology: Topology, parameters: Parameters, bodies: Bodies, first: int, h: real, slots: Slots, hulls: Hulls, stride: int):
-        start, index = wp.tid()
+    def rounded(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        hulls: Hulls,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
         for env in range(start, slots.gap.shape[0], stride):
-            pair = first + index
-            sa = topology.pairs[pair, 0]
-            sb = topology.pairs[pair, 1]
-            if far_apart(bodies, env, sa, sb):
-                set_apart(topology, slots, env, pair)
-                continue
-            slot = topology.pair_slots[pair]
-            number = topology.pair_slots[pair + 1] - slot
-            size_a = topology.shape_size[sa]
-            size_b = topology.shape_size[sb]
-            half = real(0.0)
-            if number > 1:
-                half = size_a[1]
-            xa = shape_pose(topology, bodies, env, sa)
-            xb = shape_pose(topology, bodies, env, sb)
-            near = size_a[0] + reach(topology, bodies, env, sa, wp.transform_get_translation(xa), size_a[0] + half, h)
-            near += reach(topology, bodies, env, sb, wp.transform_get_translation(xb), wp.length(size_b), h)
-            com_a, twist_a = shape_motion(topology, bodies, env, sa)
-            com_b, twist_b = shape_motion(topology, bodies, env, sb)
-            normals = wp.zeros(shape=(3,), dtype=vec3)
-            at = wp.zeros(shape=(3,), dtype=vec3)
-            gaps = wp.zeros(shape=(3,), dtype=real)
-            bends = wp.zeros(shape=(3,), dtype=real)
-            features = wp.zeros(shape=(3,), dtype=int)
-            meet(hulls, sa, sb, size_a, size_b, xa, xb, com_a, com_b, twist_a, twist_b, half, near, h, normals, at, gaps, bends, features)
-            for k in range(number):
-                if gaps[k] < real(NO_POINT):
-                    write_bent(slots, env, slot + k, at[k], normals[k], gaps[k], bends[k], features[k])
-                else:
-                    slots.gap[env, slot + k] = real(NO_POINT)
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                sa = topology.pairs[pair, 0]
+                sb = topology.pairs[pair, 1]
+                slot = topology.pair_slots[pair]
+                number = topology.pair_slots[pair + 1] - slot
+                size_a = topology.shape_size[sa]
+                size_b = topology.shape_size[sb]
+                half = real(0.0)
+                if number > 1:
+                    half = size_a[1]
+                xa = shape_pose(topology, bodies, env, sa)
+                xb = shape_pose(topology, bodies, env, sb)
+                near = size_a[0] + reach(topology, bodies, env, sa, wp.transform_get_translation(xa), size_a[0] + half, h)
+                near += reach(topology, bodies, env, sb, wp.transform_get_translation(xb), wp.length(size_b), h)
+                com_a, twist_a = shape_motion(topology, bodies, env, sa)
+                com_b, twist_b = shape_motion(topology, bodies, env, sb)
+                normals = wp.zeros(shape=(3,), dtype=vec3)
+                at = wp.zeros(shape=(3,), dtype=vec3)
+                gaps = wp.zeros(shape=(3,), dtype=real)
+                bends = wp.zeros(shape=(3,), dtype=real)
+                features = wp.zeros(shape=(3,), dtype=int)
+                meet(
+                    hulls, sa, sb, size_a, size_b, xa, xb, com_a, com_b, twist_a, twist_b, half, near, h, normals, at, gaps, bends, features
+                )
+                for k in range(number):
+                    if gaps[k] < real(NO_POINT):
+                        write_bent(slots, env, slot + k, at[k], normals[k], gaps[k], bends[k], features[k])
+                    else:
+                        slots.gap[env, slot + k] = real(NO_POINT)
 
     return rounded

@@ -49,7 +49,7 @@ def test_shipped_scenes_compile_kernels_of_what_is_in_them(name):
     scene = wl.load_usd(name)
     stages = {"kinematics", "free_motion", "combine_pairs", "select_contacts", "certify", "integrate", "reset", "proximal_contacts", "pgs"}
     pairs = {"_".join(wl.ShapeType(scene.shape_type[s]).name.lower() for s in pair) for pair in scene.pairs}
-    bounds = {"bounds"} if any(not name.startswith("plane") for name in pairs) else set()
+    bounds = {"bounds", "list_pairs"} if any(not name.startswith("plane") for name in pairs) else set()
     bounces = {"bounce", "judge", "settle"} if scene.bounces else set()
     single = scene.dofs == 6
     rows = {"contact_rows"} if bounces or not single else set()
@@ -63,9 +63,9 @@ def test_features_compile_only_their_own_kernels():
     alone, stack = kernels("box"), kernels("stack")
     assert kernels("box", "3 shapes filtered out") == alone
     assert kernels("box", "3 shapes filtered out, e = 0.5") == alone
-    assert kernels("box", "100 static boxes") == alone | {"bounds", "box_box"}
-    assert kernels("box", "10 static capsules") == alone | {"bounds", "box_capsule"}
-    assert kernels("box", "fixed body, 2 shapes") == alone | {"bounds", "box_box", "sphere_box"}
+    assert kernels("box", "100 static boxes") == alone | {"bounds", "list_pairs", "box_box"}
+    assert kernels("box", "10 static capsules") == alone | {"bounds", "list_pairs", "box_capsule"}
+    assert kernels("box", "fixed body, 2 shapes") == alone | {"bounds", "list_pairs", "box_box", "sphere_box"}
     assert kernels("stack", "kinematic belt") == stack
     assert kernels("stack", "free ball at rest") == stack | {"plane_sphere", "sphere_box"}
     assert kernels("stack", "its mass randomised") == kernels("stack", "free ball at rest")

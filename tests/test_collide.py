@@ -6,7 +6,7 @@ import pytest
 from conftest import random_quaternions, simulator
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
-from warp_lcp.kernels.collide import FADING, FAR_PAIR, HAIR, NO_POINT
+from warp_lcp.kernels.collide import FADING, HAIR, NO_POINT
 
 import warp_lcp as wl
 from warp_lcp.builder import rotation_matrix
@@ -22,6 +22,12 @@ def slots(builder: wl.ModelBuilder, q: np.ndarray, v: np.ndarray | None = None, 
         sim.v.assign(v.reshape(len(q), -1))
     sim.step()
     return (getattr(sim.slots, name).numpy() for name in names.split())
+
+
+def listed(sim: wl.Simulator, env: int = 0) -> list[int]:
+    """Pairs that kernels look at in the step, kind by kind."""
+    row, kinds = sim.listed.numpy()[env], len(sim.model.kind_pairs) - 1
+    return [int(pair) for kind in range(kinds) for pair in row[row[kind] : row[kind + 1]]]
 
 
 def box_distance(pose_a, size_a, pose_b, size_b) -> float:
@@ -147,18 +153,56 @@ def test_pairs_count_as_far_only_where_no_point_could_get_a_row():
         builder.add_box(builder.add_body(mass=1.0, com=(0, 0, 0), inertia=np.eye(3)), size, pose=(*x, 0, 0, 0, 1))
     q, v = random_poses(rng, envs, 6.0), rng.normal(size=(envs, 2, 6)) * rng.uniform(0, 10, (envs, 1, 1))
     q[::2, :, 3:], v[::2, :, :5] = (0, 0, 0, 1), 0.0  # of these the sums are the lengths
-    (gap,) = slots(builder, q, v, h, "gap")
+    sim = simulator(builder, num_envs=envs, dt=h)
+    sim.q.assign(q.reshape(envs, -1))
+    sim.v.assign(v.reshape(envs, -1))
+    sim.step()
+    gap = sim.slots.gap.numpy()
     centre = np.array([[pose[:3] + rotation_matrix(pose[3:]) @ x for pose, x in zip(env, off, strict=True)] for env in q])
     radius = np.array([np.linalg.norm(SIZE_A), np.linalg.norm(SIZE_B)])
     lever = radius + np.linalg.norm(off, axis=1)
     travel = 2 * h * (np.linalg.norm(v[..., :3], axis=2) + np.linalg.norm(v[..., 3:], axis=2) * lever)
     reach = (1.01 * radius + travel).sum(axis=1)
     distance = np.linalg.norm(centre[:, 1] - centre[:, 0], axis=1)
-    far = gap[:, 0] == FAR_PAIR
-    assert (gap[:, 1:][far] == NO_POINT).all()
+    far = np.array([listed(sim, env) == [] for env in range(envs)])
+    assert (gap[far] == NO_POINT).all()
     assert (distance[far] >= reach[far] * (1 - 1e-12)).all()
     assert far[distance > 3.0 * reach].all()
     assert (far.sum(), (distance > reach).sum(), (gap[:, 0] < NO_POINT).sum()) > (100, 200, 100)
+
+
+def test_pairs_are_listed_in_order_while_their_bounds_meet():
+    """Shapes of all sorts that fly through one another, on a plane: by numpy from their bounds, of every step."""
+    rng, envs = np.random.default_rng(5), 4
+    builder = wl.ModelBuilder()
+    builder.add_plane()
+    for k in range(12):
+        body = builder.add_body(pose=(*rng.uniform(-1, 1, 2), rng.uniform(0.3, 2), 0, 0, 0, 1))
+        if k % 3 == 0:
+            builder.add_box(body, (0.1, 0.1, 0.1))
+        elif k % 3 == 1:
+            builder.add_capsule(body, 0.1, 0.1)
+        else:
+            builder.add_sphere(body, 0.1)
+    sim = simulator(builder, num_envs=envs, dt=5e-3)
+    sim.v.assign(rng.normal(size=sim.v.shape) * 2)
+    model, came, left, before = sim.model, 0, 0, [None] * envs
+    planes = model.shape_type[model.pairs[:, 0]] == wl.ShapeType.PLANE
+    assert planes[: planes.sum()].all()
+    for _ in range(200):
+        sim.step()
+        bounds, gap, last = sim.bodies.bounds.numpy(), sim.slots.gap.numpy(), sim.slots.last_feature.numpy()
+        for env in range(envs):
+            a, b = bounds[env, model.pairs[:, 0]], bounds[env, model.pairs[:, 1]]
+            near = planes | (np.linalg.norm(b[:, :3] - a[:, :3], axis=1) < a[:, 3] + b[:, 3])
+            assert listed(sim, env) == np.flatnonzero(near).tolist()
+            away = np.repeat(~near, np.diff(model.pair_slots))
+            assert (gap[env, away] == NO_POINT).all()
+            assert (last[env, away] == -1).all()
+            if before[env] is not None:
+                came, left = came + (near & ~before[env]).sum(), left + (~near & before[env]).sum()
+            before[env] = near
+    assert min(came, left) > 50
 
 
 @pytest.mark.parametrize("shape", ["box on box", "capsule on box", "capsule on capsule"])
@@ -184,7 +228,8 @@ def test_a_body_that_comes_back_starts_with_fresh_contacts(shape):
     away.q.assign(q + np.array([100.0, 0, 0, 0, 0, 0, 0]))
     for _ in range(2):  # the second step finds it there
         away.step()
-        assert away.slots.gap.numpy()[0, 0] == FAR_PAIR
+        assert listed(away) == []
+        assert (away.slots.gap.numpy() == NO_POINT).all()
         assert (away.slots.last_feature.numpy() == -1).all()
         assert away.contacts.count.numpy()[0] == 0
     for sim in (away, fresh):

@@ -217,6 +217,7 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
     total += 4 * 4 + 3 * 8  # status, iterations, unsolved, reason; residuals
     methods = [method(model, wp.float64, law) for method in chosen("auto", "float64", law)]
     total += 4 * (len(methods) + any(method.judges for method in methods))  # lists of environments
+    total += 4 * (len(model.kind_pairs) + len(model.pairs))  # list of pairs
     if model.articulated:
         total += 4 + sum(number * wp.types.type_size_in_bytes(dtype) for _, number, dtype in articulation.layout(model, wp.float64))
     for bundle, width in widths.items():

@@ -401,6 +401,13 @@ class Model:
         return np.concatenate([[0], np.cumsum(points, dtype=np.int64)]).astype(np.int32)
 
     @property
+    def kind_pairs(self) -> np.ndarray:
+        """[K + 1] offsets: pairs kind_pairs[k] ... kind_pairs[k + 1] - 1 are of the same two shape types; kinds with planes come first."""
+        types = self.shape_type[self.pairs]
+        starts = np.flatnonzero((types[1:] != types[:-1]).any(axis=1)) + 1
+        return np.unique([0, *starts, len(types)]).astype(np.int32)
+
+    @property
     def num_slots(self) -> int:
         """Contact points that all pairs together can make."""
         return int(self.pair_slots[-1])

@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -466,14 +467,17 @@ class Simulator:
         else:
             self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
         if self.model.bounded:
-            self.launch(k.bounds, [self.topology, self.bodies, h], len(self.model.shape_body))
-        for kernel, first, number, with_hulls in self._pair_kernels:
-            more = [self.hulls] if with_hulls else []
-            self.launch(kernel, [*scene, self.bodies, first, h, self.slots, *more], number)
+            lanes = self.lanes(len(self.model.shape_body))
+            self.launch(k.bounds, [self.topology, self.bodies, h, lanes], lanes)
+            pairs = [self.topology.pairs, self.topology.pair_slots, self._kind_pairs, self._plane_kinds]
+            self.launch(k.list_pairs, [*pairs, self.bodies.bounds, self.slots.gap, self.slots.last_feature, self.listed])
+        for kind, (kernel, number, with_hulls) in enumerate(self._pair_kernels):
+            more, lanes = [self.hulls] if with_hulls else [], self.lanes(number)
+            self.launch(kernel, [*scene, self.bodies, self.listed, kind, h, self.slots, *more, lanes], lanes)
         self.reason.zero_()
-        self.launch(k.select_contacts, [*scene, self.bodies, self.slots, h, self.rows, self.status])
+        self.launch(k.select_contacts, [*scene, self.bodies, self.listed, self.slots, h, self.rows, self.status])
         if not self._methods[0].makes_rows:
-            lanes = 1 if self.device.is_cpu else self.model.max_contacts
+            lanes = self.lanes(self.model.max_contacts)
             self.launch(k.contact_rows, [*scene, self.mechanics, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
             if self.model.articulated and self.model.bodies_meet:
                 self.launch(k.calm_overlaps, [self.mechanics, self.rows, lanes], lanes)
@@ -556,6 +560,10 @@ class Simulator:
         threads = 1 if self.device.is_cpu else self.num_envs
         wp.launch(kernel, dim=(threads, width), inputs=[*inputs, threads], device=self.device)
 
+    def lanes(self, number: int) -> int:
+        """Threads that share `number` things of an environment: on a GPU one for each, on the CPU one for all."""
+        return 1 if self.device.is_cpu else number
+
     def _captured(self, name: str, launches: Callable[[], None]) -> Any:
         """The graph of some launches, captured when first asked for."""
         if name not in self._graphs:
@@ -626,6 +634,12 @@ class Simulator:
         slots.last_feature, slots.last_impulse = self._array(c, int), self._array(c, self.real)
         slots.last_bristle = self._array(c, t.vec3)
         slots.last_feature.fill_(-1)
+        #: [E, K + 1 + P] pairs that are not far apart (kernels/collide.py): all, until the first step has looked.
+        everything = np.concatenate([m.kind_pairs + len(m.kind_pairs), np.arange(len(m.pairs))]).astype(np.int32)
+        self.listed = self._array(len(everything), int)
+        self.listed.assign(np.tile(everything, (e, 1)))
+        self._kind_pairs = ints(m.kind_pairs)
+        self._plane_kinds = int((m.shape_type[m.pairs[m.kind_pairs[:-1], 0]] == ShapeType.PLANE).sum())
 
         rows = self.rows = t.Contacts()
         rows.room = r
@@ -687,8 +701,8 @@ class Simulator:
                 done.result()
 
 
-def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, int, bool]]]:
-    """Kernels of the stages by name, and (kernel, first pair, number of pairs, does it take hulls?) for each kind of pair in the model."""
+def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, bool]]]:
+    """Kernels of the stages by name, and (kernel, number of pairs, does it take hulls?) for each kind of pair in the model."""
     rows, motion = contacts.make(real, model.articulated), integrate.make(real)
     body = tree.make(real) if model.articulated else bodies.make(real)
     stages = SimpleNamespace(
@@ -700,7 +714,8 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         reset=reset.make(real),
     )
     if model.bounded:
-        stages.bounds = collide.pair_functions(real).bounds
+        far = collide.pair_functions(real)
+        stages.bounds, stages.list_pairs = far.bounds, far.list_pairs
     if not without_rows:
         stages.contact_rows = rows.contact_rows
         if model.articulated and model.bodies_meet:
@@ -716,9 +731,9 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
     else:
         stages.integrate = motion.integrate
-    kinds = [tuple(ShapeType(model.shape_type[s]).name for s in pair) for pair in model.pairs]
     pairs = []
-    for kind in dict.fromkeys(kinds):
+    for first, end in pairwise(model.kind_pairs):
+        kind = tuple(ShapeType(model.shape_type[s]).name for s in model.pairs[first])
         with_hulls = ShapeType[kind[1]] in (*CONVEX, ShapeType.MESH)
         if kind[1] == "MESH":
             kernel = mesh.make(real).round_on_mesh if kind[0] in ("SPHERE", "CAPSULE") else mesh.make(real).sharp_on_mesh
@@ -730,7 +745,7 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
             kernel = box_box.make(real)
         else:
             kernel = (capsule.make(real) if "CAPSULE" in kind else collide.make(real))[kind]
-        pairs.append((kernel, kinds.index(kind), kinds.count(kind), with_hulls))
+        pairs.append((kernel, int(end - first), with_hulls))
     return stages, pairs
 
 
