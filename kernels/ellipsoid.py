@@ -31,6 +31,9 @@ NEARER = {wp.float64: 1.0e-14, wp.float32: 1.0e-6}
 BESIDE = {wp.float64: 1.0e-60, wp.float32: 1.0e-15}
 # Of the size: what Newton's step still gains is lost in round-off.
 GAIN = {wp.float64: 1.0e-14, wp.float32: 1.0e-6}
+# Angle of Newton's last step, and how many more there are at most once separations show nothing.
+TURNED = {wp.float64: 1.0e-12, wp.float32: 1.0e-5}
+LAST = wp.constant(6)
 ROUNDS = 32
 
 
@@ -59,6 +62,11 @@ def touching(real) -> SimpleNamespace:
     def top(sq: vec3, m: vec3) -> vec3:
         """The point with the outward normal m."""
         return wp.cw_mul(sq, m) / height(sq, m)
+
+    @wp.func
+    def sharpest(sq: vec3) -> real:
+        """Least radius of curvature: what overlaps by less overlaps least along one normal only."""
+        return wp.min(sq) / wp.sqrt(wp.max(sq))
 
     @wp.func
     def foot(sq: vec3, v: vec3) -> vec3:
@@ -95,6 +103,17 @@ def touching(real) -> SimpleNamespace:
             if going:
                 root += step
         return wp.normalize(vec3(x[0] / (more[0] + root), x[1] / (more[1] + root), x[2] / (more[2] + root)))
+
+    @wp.func
+    def longest(sq: vec3) -> vec3:
+        """The axis of the longest semi-axis."""
+        i = int(0)
+        for k in range(1, 3):
+            if sq[k] > sq[i]:
+                i = k
+        result = vec3()
+        result[i] = real(1.0)
+        return result
 
     @wp.func
     def across(e: vec3) -> vec3:
@@ -142,7 +161,7 @@ def touching(real) -> SimpleNamespace:
                 best.normal = -n
                 best.face = k
         going = bool(True)
-        if best.face >= 0:
+        if best.face >= 0 and best.gap > -sharpest(sq):
             x = wp.transpose(turn) * (top(sq, best.normal) - d)
             going = bool(False)
             for k in range(sides(hulls, shape, best.face)):
@@ -156,8 +175,11 @@ def touching(real) -> SimpleNamespace:
         rounds = int(0)
         new = d + turn * support(hulls, shape, size, -(wp.transpose(turn) * d))
         while going:
+            # A plane or line that the ellipsoid crosses tells nothing of what lies beside that: then one of less dimension has it.
+            deepest = -sharpest(sq)
             least = real(1.0e30)
             kept = int(0)
+            crossed = bool(False)
             m = vec3()
             for i in range(3):
                 if count == 3 or (count == 2 and i == 2):
@@ -173,7 +195,7 @@ def touching(real) -> SimpleNamespace:
                         u = wp.dot(wp.cross(r, two), c) / area
                         v = wp.dot(wp.cross(one, r), c) / area
                         there = wp.dot(n, new) - height(sq, n)
-                        if u > real(0.0) and v > real(0.0) and u + v < real(1.0) and there < least:
+                        if u > real(0.0) and v > real(0.0) and u + v < real(1.0) and there < least and there > deepest:
                             least = there
                             m = n
                             kept = (1 << ((i + 1) % 3)) | (1 << ((i + 2) % 3))
@@ -183,12 +205,17 @@ def touching(real) -> SimpleNamespace:
                     n = foot_beside(sq, new, wp.normalize(e))
                     along = wp.dot(top(sq, n) - new, e) / wp.dot(e, e)
                     there = wp.dot(n, new) - height(sq, n)
-                    if along > real(0.0) and along < real(1.0) and there < least:
+                    if there <= deepest:
+                        crossed = True
+                    elif along > real(0.0) and along < real(1.0) and there < least:
                         least = there
                         m = n
                         kept = 1 << i
-            if kept == 0:
-                m = foot(sq, new)
+            if kept == 0 or crossed:
+                n = foot(sq, new)
+                if wp.dot(n, new) - height(sq, n) < least:
+                    m = n
+                    kept = 0
             others = int(0)
             for i in range(3):
                 if i < count and (kept & (1 << i)) != 0:
@@ -278,7 +305,7 @@ def touching(real) -> SimpleNamespace:
                 p = facing(rim, of, d, turn, m)
                 here = wp.dot(m, p) - height(sq, m)
                 last += 1
-                if last == 3:
+                if last == LAST or far < real(wp.static(TURNED[real])):
                     break
             else:
                 factor = real(1.0)
@@ -299,24 +326,37 @@ def touching(real) -> SimpleNamespace:
 
     @wp.func
     def rounded(hulls: Hulls, shape: int, size: vec3, sq: vec3, d: vec3, turn: mat33) -> Touch:
-        """Of another ellipsoid, from the best of three starts: between the centres, and from each centre to the other surface."""
+        """Of another ellipsoid, from normals towards its surface from the centre, back from its own, between both, and square to long axes.
+
+        From the first on the way to the only maximum, unless they overlap by too much for that: then the best counts.
+        """
         of = wp.cw_mul(size, size)
-        start = foot(sq, d)
         best = Touch()
         best.gap = real(-1.0e30)
         best.face = -1
-        for k in range(3):
-            m = start
+        k = int(0)
+        while k < 4:
+            m = foot(sq, d)
             if k == 1:
                 m = -(turn * foot(of, -(wp.transpose(turn) * d)))
             elif k == 2 and wp.length_sq(d) > real(0.0):
                 m = wp.normalize(d)
+            elif k == 3:
+                m = wp.cross(longest(sq), turn * longest(of))
+                if wp.length_sq(m) > real(0.0):
+                    m = wp.normalize(m)
+                else:
+                    m = across(longest(sq))
+                if wp.dot(m, d) < real(0.0):
+                    m = -m
+            m = climb(False, of, sq, d, turn, m)
             gap = wp.dot(m, facing(False, of, d, turn, m)) - height(sq, m)
             if gap > best.gap:
                 best.gap = gap
                 best.normal = m
-        best.normal = climb(False, of, sq, d, turn, best.normal)
-        best.gap = wp.dot(best.normal, facing(False, of, d, turn, best.normal)) - height(sq, best.normal)
+            k += 1
+            if gap > -sharpest(sq) - sharpest(of):
+                k = 4
         return best
 
     @wp.func
@@ -385,7 +425,7 @@ def touching(real) -> SimpleNamespace:
                 m = -(wp.cos(turned_by) * x + wp.sin(turned_by) * y + z)
                 here = wp.dot(m, tip) - height(sq, m)
                 last += 1
-                if last == 3:
+                if last == LAST or wp.abs(step) < real(wp.static(TURNED[real])):
                     break
             else:
                 factor = real(1.0)
@@ -433,7 +473,7 @@ def touching(real) -> SimpleNamespace:
             best = better(hulls, shape, size, sq, d, turn, best, m)
             if best.gap > gap:
                 settled = wp.abs(where) <= size[1]
-        if not settled:
+        if not settled or best.gap < -sharpest(sq):
             best = better(hulls, shape, size, sq, d, turn, best, round_rim(sq, size[0], d + end * size[1] * z, turn, -end * z))
             if kind == CONE:
                 best = better(hulls, shape, size, sq, d, turn, best, foot(sq, tip))
