@@ -343,10 +343,9 @@ def touching(real) -> SimpleNamespace:
                 m = wp.normalize(d)
             elif k == 3:
                 m = wp.cross(longest(sq), turn * longest(of))
-                if wp.length_sq(m) > real(0.0):
-                    m = wp.normalize(m)
-                else:
+                if wp.length_sq(m) == real(0.0):
                     m = across(longest(sq))
+                m = wp.normalize(m)
                 if wp.dot(m, d) < real(0.0):
                     m = -m
             m = climb(False, of, sq, d, turn, m)

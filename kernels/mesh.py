@@ -338,9 +338,7 @@ def make(real) -> SimpleNamespace:
                 if wp.abs(wp.dot(out, wp.transform_get_translation(place) - centre)) > around + near:
                     continue
                 flat = vec3(hulls.radius[k], real(0.0), real(0.0))
-                met = meet_ellipsoid(
-                    hulls, piece, flat, size, place, xb, com_a, com_b, twist_a, twist_b, real(0.0), core, near, h
-                )
+                met = meet_ellipsoid(hulls, piece, flat, size, place, xb, com_a, com_b, twist_a, twist_b, real(0.0), core, near, h)
                 if met.gap < near:
                     # Where the surface goes on nothing ends.
                     ends = met.face < 0 and wp.length(wp.cross(met.normal, out)) > real(LEANS)

@@ -276,8 +276,8 @@ class Model:
         shape_pose: [S, 7] pose in the owner's frame.
         shape_size: [S, 3] metres; box: half extents, sphere: radius in [0], capsule: radius in [0], half the length of its
             straight part, which lies along local z, in [1]; cylinder: radius, half length along z; cone: radius of its base at
-            z = -half, half height; ellipsoid: semi-axes; hull and mesh: half extents of its bounds, whose centre the frame is in; plane: unused
-            (normal = local +z).
+            z = -half, half height; ellipsoid: semi-axes along x, y and z; hull and mesh: half extents of its bounds, whose
+            centre the frame is in; plane: unused (normal = local +z).
         shape_hull: [S] :class:`Hull` of each hull, :class:`Mesh` of each mesh, None for other shapes.
         shape_surface_velocity: [S, 3] m/s in the shape's frame, velocity of the surface relative to the body (belts).
         friction: [S, 2] static and dynamic coefficient.
