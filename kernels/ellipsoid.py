@@ -299,7 +299,7 @@ def touching(real) -> SimpleNamespace:
             far = wp.length(step)
             if far > real(1.0):
                 step = step / far
-            if g_1 * y_1 + g_2 * y_2 < real(wp.static(GAIN[real])) * h and far < real(1.0e-2):
+            if g_1 * y_1 + g_2 * y_2 < real(wp.static(GAIN[real])) * (h + wp.length(p)) and far < real(1.0e-2):
                 # The rest converges as fast as that without a look at separations, in which it does not show.
                 m = wp.normalize(m + step)
                 p = facing(rim, of, d, turn, m)
@@ -369,8 +369,11 @@ def touching(real) -> SimpleNamespace:
         return result
 
     @wp.func
-    def round_rim(sq: vec3, radius: real, d: vec3, turn: mat33, cap: vec3) -> vec3:
-        """Normal of the largest separation from a disc whose middle d and axes `turn` are given; that of its cap is `cap`."""
+    def round_rim(sq: vec3, radius: real, d: vec3, turn: mat33, cap: vec3, hint: vec3) -> vec3:
+        """Normal of the largest separation from a disc whose middle d and axes `turn` are given; that of its cap is `cap`.
+
+        It starts from the best of a hint, the point of the rim on the side to which the ellipsoid is, and less and less leaning normals.
+        """
         of = vec3(radius, real(0.0), real(0.0))
         here = wp.dot(cap, d) - height(sq, cap)
         out = top(sq, cap) - d
@@ -379,18 +382,22 @@ def touching(real) -> SimpleNamespace:
         leans = bool(False)
         if wp.length_sq(out) > real(0.0):
             out = wp.normalize(out)
-            # From the point of the rim on the side to which the ellipsoid is, and from less and less leaning normals.
-            m = foot(sq, d + radius * out)
-            factor = real(2.0)
+            by_side = foot(sq, d + radius * out)
+            m = hint
+            if wp.length_sq(hint - cap) < real(1.0e-9):  # round-off would choose which point of the rim it means
+                m = by_side
+            factor = real(4.0)
             while factor > real(1.0e-12):
                 there = wp.dot(m, facing(True, of, d, turn, m)) - height(sq, m)
                 if there > here:
                     here = there
                     start = m
                     leans = True
-                elif leans:
+                elif leans and factor < real(2.0):
                     factor = real(0.0)
                 m = wp.normalize(cap - factor * out)
+                if factor == real(4.0):
+                    m = by_side
                 factor *= real(0.5)
         if leans:
             start = climb(True, of, sq, d, turn, start)
@@ -419,7 +426,7 @@ def touching(real) -> SimpleNamespace:
             bending = (wp.dot(d_1, wp.cw_mul(sq, d_1)) - wp.dot(q, d_1) * wp.dot(q, d_1)) / h - wp.dot(tip - q, d_2)
             bending = wp.max(bending, real(1.0e-3) * h * c * c)
             step = wp.clamp(slope / bending, real(-1.0), real(1.0))
-            if slope * step < real(wp.static(GAIN[real])) * h and wp.abs(step) < real(1.0e-2):
+            if slope * step < real(wp.static(GAIN[real])) * (h + wp.length(tip)) and wp.abs(step) < real(1.0e-2):
                 turned_by += step
                 m = -(wp.cos(turned_by) * x + wp.sin(turned_by) * y + z)
                 here = wp.dot(m, tip) - height(sq, m)
@@ -472,8 +479,12 @@ def touching(real) -> SimpleNamespace:
             best = better(hulls, shape, size, sq, d, turn, best, m)
             if best.gap > gap:
                 settled = wp.abs(where) <= size[1]
-        if not settled or best.gap < -sharpest(sq):
-            best = better(hulls, shape, size, sq, d, turn, best, round_rim(sq, size[0], d + end * size[1] * z, turn, -end * z))
+        settled = settled and best.gap > -sharpest(sq)
+        rounds = int(0)
+        while rounds < 2 and not settled:
+            rounds += 1
+            rim = round_rim(sq, size[0], d + end * size[1] * z, turn, -end * z, best.normal)
+            best = better(hulls, shape, size, sq, d, turn, best, rim)
             if kind == CONE:
                 best = better(hulls, shape, size, sq, d, turn, best, foot(sq, tip))
                 out = -(wp.transpose(turn) * best.normal)
@@ -481,6 +492,13 @@ def touching(real) -> SimpleNamespace:
                     out = -(wp.transpose(turn) * d)
                 m = slanted(sq, size, tip, turn, wp.atan2(out[1], out[0]))
                 best = better(hulls, shape, size, sq, d, turn, best, m)
+            # Where the shapes are nearest the gap leads from one surface to the other; else these are better starts than the last.
+            x = wp.transpose(turn) * (top(sq, best.normal) + best.gap * best.normal - d)
+            reach = size[0]
+            if kind == CONE:
+                reach = size[0] * (size[1] - x[2]) / (real(2.0) * size[1])
+            slack = real(1.0e-6) * (size[0] + size[1])
+            settled = wp.sqrt(x[0] * x[0] + x[1] * x[1]) < reach + slack and wp.abs(x[2]) < size[1] + slack
         return best
 
     return SimpleNamespace(Touch=Touch, height=height, top=top, foot=foot, faceted=faceted, turned=turned, rounded=rounded)
