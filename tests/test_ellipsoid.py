@@ -320,7 +320,7 @@ def test_a_heap_of_everything_comes_down():
     At 10 m/s and 2 ms what spins fast overlaps by 2.5 mm for a step or two, less than cylinders and boxes in the same heap do (17 mm).
     """
     builder = wl.ModelBuilder()
-    builder.add_box(-1, (3, 3, 0.5), pose=(0, 0, -0.5, 0, 0, 0, 1))
+    builder.add_box(-1, (30, 30, 0.5), pose=(0, 0, -0.5, 0, 0, 0, 1))
     rng = np.random.default_rng(6)
     adds = [SHAPES[kind][0] for kind in ("sphere", "capsule", "box", "cylinder", "cone", "ellipsoid")]
     adds += [lambda b, i, s=s: b.add_ellipsoid(i, s) for s in ((0.3, 0.3, 0.1), (0.4, 0.1, 0.1), (0.2, 0.2, 0.2))]
