@@ -51,6 +51,7 @@ def scenes() -> list[wl.Model]:
         many.add_sphere(many.add_body(), 0.1)
         many.add_capsule(many.add_body(), 0.1, 0.1)
         many.add_cylinder(many.add_body(), 0.1, 0.1)
+        many.add_ellipsoid(many.add_body(), (0.1, 0.2, 0.3))
     many.add_mesh(-1, [(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)])
     joints = wl.ModelBuilder()
     joints.add_plane(material=wl.Material(restitution=0.5))

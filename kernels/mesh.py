@@ -11,22 +11,24 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from . import convex, rounded
+from . import convex, ellipsoid, rounded
 from .box_box import axes
 from .collide import NO_POINT, pair_functions
 from .shapes import functions
 from .types import OPTIONS, scalar_types
 
-# Slots of a pair, by the type of the shape on the mesh: ball, capsule, sharp.
-SLOTS = {"SPHERE": 8, "CAPSULE": 12, "SHARP": 24}
+# Slots of a pair, by the type of the shape on the mesh: ball, capsule, sharp, ellipsoid.
+SLOTS = {"SPHERE": 8, "CAPSULE": 12, "SHARP": 24, "ELLIPSOID": 8}
 MOST = max(SLOTS.values())
 # Of the size: points closer than this with normals alike are one.
 SAME = wp.constant(1.0e-6)
+# Sine: an ellipsoid that touches a seam leans by less than this from the triangles on either side, which need not be quite in one plane.
+LEANS = wp.constant(1.0e-4)
 
 
 @functools.cache
 def make(real) -> SimpleNamespace:
-    """Kernels ``sharp_on_mesh`` and ``round_on_mesh``; launch with dim (E, lanes)."""
+    """Kernels ``sharp_on_mesh``, ``round_on_mesh`` and ``ellipsoid_on_mesh``; launch with dim (E, lanes)."""
     t = scalar_types(real)
     vec3, transform = t.vec3, t.transform
     Bodies, Parameters, Slots, Topology = t.Bodies, t.Parameters, t.Slots, t.Topology
@@ -34,7 +36,8 @@ def make(real) -> SimpleNamespace:
     shape_pose, reach, shape_velocity, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write_bent
     shape_motion = f.shape_motion
     inverse_mass, touching_depth = a.inverse_mass, a.touching_depth
-    meet_sharp, meet_round = convex.meeting(real), rounded.meeting(real)
+    meet_sharp, meet_round, meet_ellipsoid = convex.meeting(real), rounded.meeting(real), ellipsoid.meeting(real, "faceted").meet
+    side_plane = functions(real).side_plane
 
     @wp.func
     def collect(
@@ -293,4 +296,90 @@ def make(real) -> SimpleNamespace:
                             )
                 settle(slots, env, slot, number, normals, at, gaps, bends, features, count)
 
-    return SimpleNamespace(sharp_on_mesh=sharp_on_mesh, round_on_mesh=round_on_mesh)
+    @wp.func
+    def at_seam(hulls: Hulls, piece: int, place: transform, point: vec3, slack: real) -> bool:
+        """Is the nearest point of a triangle on a side beyond which the surface goes on, or on a corner between two such sides?"""
+        face = hulls.first_face[piece]
+        x = wp.transform_point(wp.transform_inverse(place), point)
+        on = int(0)
+        seams = int(0)
+        for k in range(3):
+            plane = side_plane(hulls, piece, vec3(), face, k)
+            if plane[0] * x[0] + plane[1] * x[1] + plane[2] * x[2] > plane[3] - slack:
+                on += 1
+                if (hulls.seam[face] & (1 << k)) != 0:
+                    seams += 1
+        return on > 0 and on == seams
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def ellipsoid_on_mesh(
+        topology: Topology,
+        parameters: Parameters,
+        bodies: Bodies,
+        listed: wp.array2d(dtype=int),
+        kind: int,
+        h: real,
+        slots: Slots,
+        hulls: Hulls,
+        lanes: int,
+        stride: int,
+    ):
+        start, lane = wp.tid()
+        for env in range(start, slots.gap.shape[0], stride):
+            for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
+                pair = listed[env, index]
+                sa = topology.pairs[pair, 0]
+                sb = topology.pairs[pair, 1]
+                size = topology.shape_size[sb]
+                around = wp.max(size)
+                core = wp.min(size)
+                xa = shape_pose(topology, bodies, env, sa)
+                xb = shape_pose(topology, bodies, env, sb)
+                centre = wp.transform_get_translation(xb)
+                near = reach(topology, bodies, env, sb, centre, around, h) + reach(topology, bodies, env, sa, centre, around, h)
+                com_a, twist_a = shape_motion(topology, bodies, env, sa)
+                com_b, twist_b = shape_motion(topology, bodies, env, sb)
+                normals = wp.zeros(shape=(MOST,), dtype=vec3)
+                at = wp.zeros(shape=(MOST,), dtype=vec3)
+                gaps = wp.zeros(shape=(MOST,), dtype=real)
+                bends = wp.zeros(shape=(MOST,), dtype=real)
+                features = wp.zeros(shape=(MOST,), dtype=int)
+                count = int(0)
+                slot = topology.pair_slots[pair]
+                number = topology.pair_slots[pair + 1] - slot
+                low = bounds_in(xa, centre, around + near, real(-1.0))
+                high = bounds_in(xa, centre, around + near, real(1.0))
+                query = wp.mesh_query_aabb(hulls.mesh[sa], low, high)
+                triangle = int(0)
+                while wp.mesh_query_aabb_next(query, triangle):
+                    k = hulls.first_piece[sa] + triangle
+                    piece = topology.shape_size.shape[0] + k
+                    place = wp.transform_multiply(xa, transform(hulls.centre[k], wp.quat_identity(dtype=real)))
+                    out = normal_of(hulls, xa, piece)
+                    if wp.abs(wp.dot(out, wp.transform_get_translation(place) - centre)) > around + near:
+                        continue
+                    flat = vec3(hulls.radius[k], real(0.0), real(0.0))
+                    met = meet_ellipsoid(hulls, piece, flat, size, place, xb, com_a, com_b, twist_a, twist_b, real(0.0), core, near, h)
+                    if met.gap < near:
+                        # Where the surface goes on nothing ends.
+                        ends = met.face < 0 and wp.length(wp.cross(met.normal, out)) > real(LEANS)
+                        on_piece = met.point - met.normal * (real(0.5) * met.gap)
+                        if not (ends and at_seam(hulls, piece, place, on_piece, real(SAME) * flat[0])):
+                            count = collect(
+                                normals,
+                                at,
+                                gaps,
+                                bends,
+                                features,
+                                count,
+                                number,
+                                real(SAME) * around,
+                                met.normal,
+                                met.point,
+                                met.gap,
+                                met.bend,
+                                triangle,
+                            )
+                settle(slots, env, slot, number, normals, at, gaps, bends, features, count)
+
+    return SimpleNamespace(sharp_on_mesh=sharp_on_mesh, round_on_mesh=round_on_mesh, ellipsoid_on_mesh=ellipsoid_on_mesh)

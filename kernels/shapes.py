@@ -17,7 +17,7 @@ SPHERE = wp.constant(1)
 CAPSULE = wp.constant(3)
 CYLINDER = wp.constant(4)
 CONE = wp.constant(5)
-PIECE = wp.constant(8)  # a triangle of a mesh: a hull without thickness
+PIECE = wp.constant(9)  # a triangle of a mesh: a hull without thickness
 # Sides of the polygon inside a round cap to which faces are clipped, and corners of that which lands on a face.
 ROUND = 16
 CORNERS = 8

@@ -91,7 +91,7 @@ def scalar_types(real) -> SimpleNamespace:
         v_start: wp.array(dtype=int)  # [B]
         shape_body: wp.array(dtype=int)  # [S] -1 = world
         shape_pose: wp.array(dtype=transform)  # [S] in the body frame
-        shape_size: wp.array(dtype=vec3)  # [S] half extents | radius | capsule: radius, half length along z
+        shape_size: wp.array(dtype=vec3)  # [S] half extents | radius | semi-axes | capsule: radius, half length along z
         surface_velocity: wp.array(dtype=vec3)  # [S] shape frame, m/s
         pairs: wp.array2d(dtype=int)  # [P, 2]
         pair_body: wp.array(dtype=wp.vec2i)  # [P] bodies of the two shapes, -1 = world

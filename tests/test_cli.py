@@ -24,7 +24,7 @@ pytest.importorskip("pxr", reason="needs the extra 'usd'")
 
 ROOT = Path(__file__).resolve().parents[1]
 OPENUSD = ROOT.parent / "shared" / "usd" / "openusd"
-EGG = """def Sphere "Egg" (prepend apiSchemas = ["PhysicsCollisionAPI"])
+PILL = """def Capsule "Pill" (prepend apiSchemas = ["PhysicsCollisionAPI"])
 {
     double3 xformOp:scale = (1, 1, 2)
     uniform token[] xformOpOrder = ["xformOp:scale"]
@@ -167,17 +167,17 @@ def test_info_lists_scenes_made_elsewhere(capsys, scene, bodies):
 
 
 def test_info_lists_what_cannot_be_simulated(capsys, tmp_path):
-    scene = tmp_path / "egg.usda"
+    scene = tmp_path / "pill.usda"
     hinge = 'def PhysicsRevoluteJoint "Hinge" {\nrel physics:body0 = </Box>\n}\n'
-    scene.write_text(HEADER + PHYSICS + BOX % 2 + hinge + EGG)
+    scene.write_text(HEADER + PHYSICS + BOX % 2 + hinge + PILL)
     facts = info(capsys, scene)
     assert (facts["simulable"], facts["dofs"], facts["pairs"], facts["joints"]) == (False, None, None, [{"name": "/Hinge", "type": None}])
     assert facts["bodies"][0]["name"] == "/Box"
-    assert facts["unsupported"][0]["path"] == "/Egg"
+    assert facts["unsupported"][0]["path"] == "/Pill"
     assert main(["info", str(scene)]) == 0
     text = capsys.readouterr().out
     assert "cannot be simulated" in text
-    assert "/Egg" in text
+    assert "/Pill" in text
 
 
 def test_info_lists_joints(capsys, tmp_path):
@@ -364,8 +364,8 @@ def test_scenes_that_run_refuses(capsys, tmp_path):
     scene = tmp_path / "scene.usda"
     scene.write_text(HEADER + PHYSICS + BOX.replace(', "PhysicsCollisionAPI"', "") % 0)
     assert "/Box" in error_line(capsys, "run", scene)  # without mass
-    scene.write_text(HEADER + PHYSICS + BOX % 1 + EGG)
-    assert "/Egg" in error_line(capsys, "run", scene)
+    scene.write_text(HEADER + PHYSICS + BOX % 1 + PILL)
+    assert "/Pill" in error_line(capsys, "run", scene)
     assert "no shipped scene of this name" in error_line(capsys, "run", "box_on_grund")
     assert "did you mean" in error_line(capsys, "info", "box_on_grund")
 

@@ -290,6 +290,16 @@ def test_cylinders_cones_hulls_and_meshes_are_drawn(tmp_path):
         assert (np.einsum("ij,ij->i", n, normals[triangles[:, 0]]) > 0.99 * np.linalg.norm(n, axis=1)).all()
 
 
+def test_ellipsoids_are_drawn_with_their_axes(tmp_path):
+    builder = wl.ModelBuilder()
+    builder.add_plane()
+    builder.add_ellipsoid(builder.add_body("egg", pose=(0, 0, 0.3, 0, 0, 0, 1)), (0.1, 0.2, 0.3), name="egg")
+    path = tmp_path / "run.rrd"
+    _, logger, _ = simulate(path, builder.finalize(), frames=1, every=1)
+    assert read(path, "/world/bodies/egg", "Ellipsoids3D:half_sizes")[0][1][0] == pytest.approx([0.1, 0.2, 0.3])
+    assert logger.layout.size == pytest.approx(0.6)  # the ball around it
+
+
 def test_killed_process_leaves_its_frames(tmp_path):
     script = tmp_path / "run.py"
     script.write_text(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import warp_lcp as wl
 from warp_lcp import JointType, ShapeType, scenes
@@ -169,14 +170,32 @@ def test_mirrored_transforms_keep_proper_rotations():
     assert normal == pytest.approx([-1, 0, 0], abs=1e-12)  # +x, mirrored
 
 
-def test_sheared_cube_and_ellipsoids_are_refused():
+def test_sheared_cube_and_capsule_with_ellipsoids_are_refused():
     slanted = prim("Xform", "X", (), xform(scale="(1, 2, 1)") + cube("C", xform(rotateZ=30)))
-    egg = prim("Sphere", "Egg", (COLLIDER,), xform(scale="(1, 1, 1.5)"))
     pill = prim("Capsule", "Pill", (COLLIDER,), xform(scale="(1, 1, 1.5)"))
-    message = refused(body(), slanted, egg, pill)
+    message = refused(body(), slanted, pill)
     assert "sheared Cube collider /X/C" in message
-    assert "ellipsoid /Egg" in message
     assert "Capsule collider with ends scaled to ellipsoids /Pill" in message
+
+
+def test_spheres_scaled_unevenly_are_ellipsoids():
+    """Their points x = L u + c, |u| = radius, have |A^-1 R^T (x - c)| = 1, however turned, mirrored, slanted or scaled; mass by volume."""
+    egg = prim("Sphere", "Egg", (COLLIDER,), "double radius = 2;" + xform(translate="(1, 2, 3)", rotateZ=30, scale="(0.5, -1, 1.5)"))
+    slanted = prim("Xform", "X", (), xform(scale="(1, 2, 1)") + prim("Sphere", "S", (COLLIDER,), xform(rotateZ=30, scale="(1, 1, 3)")))
+    model = load(body(inner=egg), body("B2", inner=slanted), head=CM)
+    assert model.shape_type.tolist() == [ShapeType.ELLIPSOID] * 2
+    assert model.shape_size[0] == pytest.approx([0.01, 0.02, 0.03])
+    turn = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    for shape, linear in enumerate((0.02 * turn @ np.diag([0.5, -1, 1.5]), 0.01 * np.diag([1, 2, 1]) @ turn @ np.diag([1, 1, 3]))):
+        u = np.random.default_rng(0).normal(size=(20, 3))
+        x = (u / np.linalg.norm(u, axis=1, keepdims=True)) @ linear.T
+        within = x @ wl.builder.rotation_matrix(model.shape_pose[shape, 3:]) / model.shape_size[shape]
+        assert np.linalg.norm(within, axis=1) == pytest.approx(np.ones(20), rel=1e-6)  # scales are single precision
+        mass = 1000 * 4 / 3 * np.pi * abs(np.linalg.det(linear))
+        assert model.mass[shape] == pytest.approx(mass, rel=1e-6)
+        square = linear @ linear.T  # the integral of x x^T over an ellipsoid is a fifth of its mass times this
+        assert model.inertia[shape] == pytest.approx(mass / 5 * (np.trace(square) * np.eye(3) - square), rel=1e-5, abs=1e-6 * mass * 1e-4)
+    assert model.shape_pose[0, :3] == pytest.approx([0.01, 0.02, 0.03])
 
 
 @pytest.mark.parametrize(("axis", "along"), [("X", (0, 1, 0)), ("Y", (-1, 0, 0)), ("Z", (0, 0, 1))])

@@ -69,6 +69,9 @@ class _Shape:
             return 8.0 * float(np.prod(self.size)), centre, np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) / 3.0
         if self.type is ShapeType.SPHERE:
             return 4.0 / 3.0 * np.pi * r**3, centre, np.eye(3) * 0.4 * r**2
+        if self.type is ShapeType.ELLIPSOID:
+            s = self.size**2
+            return 4.0 / 3.0 * np.pi * float(np.prod(self.size)), centre, np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) / 5.0
         if self.type is ShapeType.CAPSULE:
             volume, along, across = capsule_solid(r, h)
         elif self.type is ShapeType.CYLINDER:
@@ -290,6 +293,17 @@ class ModelBuilder:
         """Add a sphere of the given radius [m]; ``options`` as for :meth:`add_box`. Returns the shape's index."""
         radius = _positive("sphere: radius", radius, "m")
         return self._add_shape(ShapeType.SPHERE, body, pose, np.array([radius, 0.0, 0.0]), **options)
+
+    def add_ellipsoid(self, body: int, semi_axes: Sequence[float], *, pose: Sequence[float] = IDENTITY, **options) -> int:
+        """Add an ellipsoid with semi-axes [3] m along the shape's x, y and z; ``options`` as for :meth:`add_box`. Returns its index.
+
+        Raises:
+            ModelError: for other than three semi-axes, or one that is not positive and finite.
+        """
+        size = np.array([_positive("ellipsoid: semi-axis", s, "m") for s in semi_axes])
+        if size.shape != (3,):
+            raise ModelError(f"ellipsoid: semi_axes has {size.size} numbers; give 3")
+        return self._add_shape(ShapeType.ELLIPSOID, body, pose, size, **options)
 
     def add_capsule(self, body: int, radius: float, half_length: float, *, pose: Sequence[float] = IDENTITY, **options) -> int:
         """Add a capsule along the shape's z axis; ``options`` as for :meth:`add_box`. Returns the shape's index.

@@ -311,11 +311,14 @@ class RerunLogger:
                 solid = Hull(solid.points, tuple(map(tuple, solid.triangles.tolist())))
             vertices, normals, triangles = flat_faces(solid)
             return rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_normals=normals, albedo_factor=color)
-        clear = kind in (ShapeType.BOX, ShapeType.CAPSULE, ShapeType.CYLINDER) and shape in self._moving  # the forces on it start inside
+        see_through = (ShapeType.BOX, ShapeType.CAPSULE, ShapeType.CYLINDER, ShapeType.ELLIPSOID)
+        clear = kind in see_through and shape in self._moving  # the forces on it start inside
         mode = rr.components.FillMode.TransparentFillMajorWireframe if clear else rr.components.FillMode.Solid
         if kind == ShapeType.CAPSULE:  # Rerun's own start at z = 0
             at = [(0.0, 0.0, -half[1])]
             return rr.Capsules3D(lengths=[2.0 * half[1]], radii=[half[0]], translations=at, colors=[color], fill_mode=mode)
+        if kind == ShapeType.ELLIPSOID:
+            return rr.Ellipsoids3D(half_sizes=[half], colors=[color], fill_mode=mode)
         if kind == ShapeType.CYLINDER:
             return rr.Cylinders3D(lengths=[2.0 * half[1]], radii=[half[0]], colors=[color], fill_mode=mode)
         return rr.Boxes3D(half_sizes=[half], colors=[color], fill_mode=mode)
@@ -470,6 +473,7 @@ def lay_out(model: Model, pose: np.ndarray, velocity: np.ndarray, moving: Sequen
     around = np.linalg.norm(half, axis=-1)  # radius of the bounding sphere: a sphere has its radius alone there
     kind = model.shape_type[shapes]
     around = np.where(kind == ShapeType.CAPSULE, half[:, 0] + half[:, 1], around)
+    around = np.where(kind == ShapeType.ELLIPSOID, half.max(axis=-1), around)
     long = np.where(kind == ShapeType.CAPSULE, around, half[:, 1])
     turned = np.isin(kind, (ShapeType.CAPSULE, ShapeType.CYLINDER, ShapeType.CONE))  # radius, half length -> half extents
     half = np.where(turned[:, None], np.stack([half[:, 0], half[:, 0], long], axis=-1), half)

@@ -81,6 +81,7 @@ class ShapeType(enum.IntEnum):
     CONE = 5
     HULL = 6
     MESH = 7
+    ELLIPSOID = 8
 
 
 #: Shapes whose pairs are looked at with ``shapes.Hulls``.
@@ -106,6 +107,7 @@ CONTACT_POINTS: dict[tuple[ShapeType, ShapeType], int] = {
     (ShapeType.SPHERE, ShapeType.MESH): 8,
     (ShapeType.CAPSULE, ShapeType.MESH): 12,
     **{(kind, ShapeType.MESH): 24 for kind in (ShapeType.BOX, *CONVEX)},
+    **{(kind, ShapeType.ELLIPSOID): 8 if kind is ShapeType.MESH else 1 for kind in ShapeType},
 }
 
 #: Contact parameters of Table 1 for a body of 1 kg; an unauthored parameter is this times the mass of the lighter
@@ -274,8 +276,8 @@ class Model:
         shape_pose: [S, 7] pose in the owner's frame.
         shape_size: [S, 3] metres; box: half extents, sphere: radius in [0], capsule: radius in [0], half the length of its
             straight part, which lies along local z, in [1]; cylinder: radius, half length along z; cone: radius of its base at
-            z = -half, half height; hull and mesh: half extents of its bounds, whose centre the frame is in; plane: unused
-            (normal = local +z).
+            z = -half, half height; ellipsoid: semi-axes along x, y and z; hull and mesh: half extents of its bounds, whose
+            centre the frame is in; plane: unused (normal = local +z).
         shape_hull: [S] :class:`Hull` of each hull, :class:`Mesh` of each mesh, None for other shapes.
         shape_surface_velocity: [S, 3] m/s in the shape's frame, velocity of the surface relative to the body (belts).
         friction: [S, 2] static and dynamic coefficient.

@@ -25,6 +25,7 @@ from .kernels import (
     collide,
     contacts,
     convex,
+    ellipsoid,
     integrate,
     joint_rows,
     mesh,
@@ -734,8 +735,10 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     pairs = []
     for first, end in pairwise(model.kind_pairs):
         kind = tuple(ShapeType(model.shape_type[s]).name for s in model.pairs[first])
-        with_hulls = ShapeType[kind[1]] in (*CONVEX, ShapeType.MESH)
-        if kind[1] == "MESH":
+        with_hulls = ShapeType[kind[1]] in (*CONVEX, ShapeType.MESH) or (kind[1] == "ELLIPSOID" and kind[0] != "PLANE")
+        if kind[1] == "ELLIPSOID":
+            kernel = mesh.make(real).ellipsoid_on_mesh if kind[0] == "MESH" else ellipsoid.make(real)[kind[0]]
+        elif kind[1] == "MESH":
             kernel = mesh.make(real).round_on_mesh if kind[0] in ("SPHERE", "CAPSULE") else mesh.make(real).sharp_on_mesh
         elif with_hulls and kind[0] in ("SPHERE", "CAPSULE"):
             kernel = rounded.make(real)

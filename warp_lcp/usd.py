@@ -436,8 +436,18 @@ class _Reader:
     def _half_extents(self, prim: Any, frame: _Frame) -> np.ndarray:
         return 0.5 * float(self.px.UsdGeom.Cube(prim).GetSizeAttr().Get()) * frame.scale
 
-    def _radius(self, prim: Any) -> float:
-        return float(self.px.UsdGeom.Sphere(prim).GetRadiusAttr().Get())
+    def _sphere(self, prim: Any, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
+        """Semi-axes [3] of a Sphere in stage units, all alike where it is scaled evenly, and the rotation of their axes.
+
+        A slanted ball is an ellipsoid as well; its axes are then the principal ones of what turns the ball into it.
+        """
+        radius, stretch = float(self.px.UsdGeom.Sphere(prim).GetRadiusAttr().Get()), frame.stretch
+        if stretch[0] - stretch[2] <= _UNIFORM * stretch[0]:
+            return np.full(3, radius * frame.scale.max()), frame.rotation
+        if not frame.sheared:
+            return radius * frame.scale, frame.rotation
+        axes, _, _ = np.linalg.svd(frame.linear)
+        return radius * stretch, axes * [1.0, 1.0, np.linalg.det(axes)]
 
     def _capsule(self, prim: Any, frame: _Frame) -> tuple[float, float]:
         """Radius and half the length of the straight part."""
@@ -456,6 +466,8 @@ class _Reader:
         index, kind = -1 if body is None else body.index, str(desc.type).rpartition(".")[2]
         if kind == "PlaneShape":
             rotation = self._plane_rotation(prim, frame)
+        elif kind == "SphereShape":
+            semi_axes, rotation = self._sphere(prim, frame)
         elif kind == "CapsuleShape":  # the prim's axis becomes the shape's z
             rotation = np.roll(frame.rotation, 2 - "XYZ".index(str(self.px.UsdGeom.Capsule(prim).GetAxisAttr().Get())), axis=1)
         else:
@@ -485,8 +497,10 @@ class _Reader:
                 shape = self._add_solid(index, solid, options)
             elif kind == "PlaneShape":
                 shape = self.builder.add_plane(index, **options)
+            elif kind == "SphereShape" and semi_axes.min() == semi_axes.max():
+                shape = self.builder.add_sphere(index, self.length * semi_axes[0], **options)
             elif kind == "SphereShape":
-                shape = self.builder.add_sphere(index, self.length * self._radius(prim) * frame.scale.max(), **options)
+                shape = self.builder.add_ellipsoid(index, (self.length * semi_axes).tolist(), **options)
             elif kind == "CapsuleShape":
                 radius, half_length = self._capsule(prim, frame)
                 shape = self.builder.add_capsule(index, self.length * radius, self.length * half_length, **options)
@@ -533,9 +547,8 @@ class _Reader:
         if kind == "PlaneShape" and owner is not None and not owner.kinematicBody:
             return name, "a plane is infinite and cannot move freely; make it static or its body kinematic"
         stretch = frame.stretch
-        if kind in ("SphereShape", "CapsuleShape") and stretch[0] - stretch[2] > _UNIFORM * stretch[0]:
-            what = "Sphere collider scaled to an ellipsoid" if kind == "SphereShape" else "Capsule collider with ends scaled to ellipsoids"
-            return what, "this shape is not supported yet; scale all axes alike"
+        if kind == "CapsuleShape" and stretch[0] - stretch[2] > _UNIFORM * stretch[0]:
+            return "Capsule collider with ends scaled to ellipsoids", "this shape is not supported yet; scale all axes alike"
         if kind in ("CylinderShape", "ConeShape"):
             axis = "XYZ".index(str(desc.axis).rpartition(".")[2])
             one, other = frame.scale[(axis + 1) % 3], frame.scale[(axis + 2) % 3]

@@ -126,8 +126,12 @@ class MassReader:
             half = self.reader._half_extents(prim, frame)
             return 8.0 * float(np.prod(half)), np.diag(half @ half - half**2) / 3.0, np.zeros(3)
         if kind == "SphereShape":
-            radius = self.reader._radius(prim) * frame.scale.max()
-            return 4.0 / 3.0 * math.pi * radius**3, 0.4 * radius**2 * np.eye(3), np.zeros(3)
+            size, rotation = self.reader._sphere(prim, frame)
+            if size.min() == size.max():
+                return 4.0 / 3.0 * math.pi * size[0] ** 3, 0.4 * size[0] ** 2 * np.eye(3), np.zeros(3)
+            turn = frame.rotation.T @ rotation
+            inertia = turn @ np.diag(0.2 * (size @ size - size**2)) @ turn.T
+            return 4.0 / 3.0 * math.pi * float(np.prod(size)), inertia, np.zeros(3)
         if kind == "MeshShape":
             return self._mesh_mass(prim, desc, frame)
         if kind not in ("CapsuleShape", "CylinderShape", "ConeShape"):

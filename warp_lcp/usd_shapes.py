@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colliders of USD that are no plane, cube, sphere or capsule: cylinders, cones and meshes, in the prim's own axes.
+"""Colliders of USD that are no plane, cube, sphere, ellipsoid or capsule: cylinders, cones and meshes, in the prim's own axes.
 
 What is made of a mesh, by its ``physics:approximation``:
 
