@@ -46,7 +46,8 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Tree:
-    """Joints of a robot: fields of warp_lcp's Model under their names, its start in its coordinates, q [E, nq] and v [E, nv]."""
+    """Joints of a robot: fields of warp_lcp's Model under their names, those of its L loops as loop_ and their names (bodies [L, 2],
+    frames [L, 2, 7], ways and turns [L, 3]), its start in its coordinates, q [E, nq] and v [E, nv]."""
 
     body_parent: np.ndarray
     joint_type: np.ndarray
@@ -64,6 +65,10 @@ class Tree:
     drive: np.ndarray
     com: np.ndarray
     pairs: np.ndarray
+    loop_bodies: np.ndarray
+    loop_frames: np.ndarray
+    loop_ways: np.ndarray
+    loop_turns: np.ndarray
     q: np.ndarray
     v: np.ndarray
 
@@ -102,6 +107,19 @@ class Job:
     def envs(self) -> int:
         """Number of environments."""
         return len(self.pose)
+
+
+def closure(tree: Tree, loop: int) -> str:
+    """What closes a loop: a "ball", a "hinge" about one axis of its frames, or a "weld".
+
+    Raises:
+        Refused: for any other joint.
+    """
+    kinds = {0: "ball", 2: "hinge", 3: "weld"}
+    turns = int(tree.loop_turns[loop].sum())
+    if not tree.loop_ways[loop].all() or turns not in kinds:
+        raise Refused("loops are closed by balls, hinges and welds")
+    return kinds[turns]
 
 
 class Engine(ABC):
