@@ -17,7 +17,7 @@ import numpy as np
 from protocol import Job, Refused, Tree, closure
 
 #: Settings that are attributes of <option>.
-OPTIONS = ("cone", "impratio", "iterations", "tolerance", "noslip_iterations", "noslip_tolerance", "solver")
+OPTIONS = ("integrator", "cone", "impratio", "iterations", "tolerance", "noslip_iterations", "noslip_tolerance", "solver")
 # warp_lcp.JointType and DofKind
 FREE, KINEMATIC, SPHERICAL = 0, 1, 5
 LINEAR, BALL_ON = 0, 3
