@@ -43,7 +43,7 @@ def model(job: Job) -> str:
     steps = job.settings.get("time_constant_steps")
     spring = f'solref="{steps * job.dt} 1"' if steps else ""
     surface = f'condim="3" friction="{job.friction} 0.005 0.0001" {spring}'
-    stops = f'<default><joint {spring.replace("solref", "solreflimit")}/></default>' if steps and job.tree is not None else ""
+    stops = f"<default><joint {spring.replace('solref', 'solreflimit')}/></default>" if steps and job.tree is not None else ""
     geoms: dict[int, str] = dict.fromkeys(range(-1, len(job.mass)), "")
     for kind, body, size, pose in zip(job.shape_kind, job.shape_body, job.shape_size, job.shape_pose, strict=True):
         extent = numbers({"plane": np.array([0.0, 0.0, 1.0]), "box": size, "sphere": size[:1]}.get(kind, size[:2]))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from itertools import pairwise
 from typing import Any
 
 import newton
@@ -75,7 +76,7 @@ class NewtonEngine(protocol.Engine):
             else:
                 found.append(world.add_joint_d6(linear_axes=axes[True], angular_axes=axes[False], **where))
         cut = [0, *self.cuts(tree), len(found)]
-        for begin, end in zip(cut[:-1], cut[1:], strict=True):
+        for begin, end in pairwise(cut):
             world.add_articulation(found[begin:end])
         self.close(world, tree)
 
