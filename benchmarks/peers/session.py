@@ -121,7 +121,14 @@ class Session:
         state, result = self.work / f"state{index}.npz", self.work / f"result{index}.npz"
         scene.save(state)
         job = {name: getattr(scene, name) for name in ("dt", "steps", "friction", "restitution")}
-        job |= {"scene": scene.name, "every": every, "timed": timed, "settings": self.peer.variants[variant], "state": str(state), "result": str(result)}
+        job |= {
+            "scene": scene.name,
+            "every": every,
+            "timed": timed,
+            "settings": self.peer.variants[variant],
+            "state": str(state),
+            "result": str(result),
+        }
         reply = self.order({"do": "make", "id": index, "job": job}, variant)
         with np.load(result) as arrays:
             states = {name: arrays[name] for name in ("pose", "velocity", "before_pose", "before_velocity")}
