@@ -4,9 +4,9 @@
 Orders, each with the "id" of a job that the caller chooses:
 
     {"do": "make", "id", "job": {scene, dt, steps, every, timed, friction, restitution, settings, state, result}}
-        Build the engine and run the job once, with everything recorded; `timed` says whether it will be run
-        again. `state` is the .npz that benchmarks.scenes.Scene.save
-        or, with joints, benchmarks.robots.Robot.save writes. The reply is {info, seconds: of the run}; the .npz `result` holds
+        Build the engine and run the job once, with everything recorded; `timed` says whether it will be run again. `state` is the
+        .npz that benchmarks.scenes.Scene.save or, with joints, benchmarks.robots.Robot.save writes. The reply is {info, seconds: of
+        the run}; the .npz `result` holds
         pose [T, E, B, 7] (x y z qx qy qz qw) and velocity [T, E, B, 6] (linear of the centre of mass, then angular; world axes)
         at the start and after every `every` steps, as the engine gives them back, before_pose and before_velocity
         [T - 1, E, B, ..], one step before each of the later samples, and contacts, their mean number in an environment and a step.
