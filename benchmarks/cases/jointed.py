@@ -196,7 +196,7 @@ STOP_HIT = Case(
     fails="penalty springs bounce or let it through",
     charted=True,
     label="pendulum on a stop",
-    timed_from=0.7,  # it hits at 0.53 s
+    timed_from=0.7,  # it hits at 0.47 s
 )
 
 # ------------------------------------------------------------------------------------------------- Painleve's rod, on joints
