@@ -23,6 +23,8 @@ import numpy as np
 import warp as wp
 from tqdm import tqdm
 
+import warp_lcp as wl
+
 from . import energy_error, motion, stability
 from .cases import CASES, Case
 from .motion import Motion
@@ -93,29 +95,32 @@ def path(moved: Motion) -> dict[str, list[float]]:
 
 
 @cache
-def settled(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Pose and velocity that the timed part of a case starts from, for everyone: of our own motion at 1 ms."""
+def settled(name: str) -> dict[str, Any]:
+    """Fields of a Scene that say where the timed part of a case starts, for everyone: of our own motion at 1 ms."""
     case = CASES[name]
     if not case.timed_from:
-        scene = case.scene(1e-3)
-        return scene.pose, scene.velocity
-    scene = replace(case.scene(1e-3), steps=round(case.timed_from / 1e-3))
-    moved = motion.simulate(scene, scene.steps, device="cpu")
-    return moved.pose[-1], moved.velocity[-1]
+        return {}
+    scene = case.scene(1e-3)
+    sim = scene.simulator(device="cpu")
+    sim.step(round(case.timed_from / 1e-3))
+    pose, velocity = (array.numpy().astype(float) for array in (sim.body_pose, sim.body_velocity))
+    if scene.made is None:
+        return {"pose": pose, "velocity": velocity}
+    made = replace(scene.made, q0=sim.q.numpy()[0].astype(float), v0=sim.v.numpy()[0].astype(float))
+    return {"pose": pose, "velocity": velocity, "made": made}
 
 
 def part(case: Case, h: float, env_step: float = 0.0) -> Scene:
     """The batch that is timed, if a step of an environment takes about so many seconds."""
-    pose, velocity = settled(case.name)
-    scene = replace(case.scene(h), pose=pose, velocity=velocity)
+    scene = replace(case.scene(h), **settled(case.name))
     number = min(max(LEAST_STEPS, round(TIMED / h)), MOST_STEPS)
     most = TURN / (env_step * number) if env_step else math.inf
     return replace(scene.copies(int(min(ENVS, max(LEAST_ENVS, most)))), steps=number)
 
 
 def energy_errors(moved: Motion) -> dict[str, float | None]:
-    """What the timed part's steps miss of the laws [J], of a motion that is sampled at every step."""
-    return {"E_uc": None if moved.scene.restitution else energy_error.largest(moved)}
+    """What the timed part's steps miss of the laws [J], of a motion that is sampled at every step; None where it is not defined."""
+    return {"E_uc": energy_error.largest(moved) if energy_error.defined(moved.scene) else None}
 
 
 def spread(seconds: list[float], scene: Scene) -> dict[str, float]:
@@ -169,7 +174,7 @@ def ours_at(case: Case, h: float, device: Any) -> tuple[list[dict[str, Any]], li
             knob = f"{1e3 * h:g} ms" if k is None else f"k = {k}"
             try:
                 moved = case.simulate(h, device=device, limit=PATIENCE, **options)
-            except motion.TooSlow as why:
+            except (motion.TooSlow, wl.WarpLcpError) as why:  # what an option does not know yet is left out as in other engines
                 points.append({"case": case.name, "engine": "warp_lcp", "setting": curve.name, "knob": knob, "h": h, "left_out": str(why)})
                 continue
             points.append(point(case, moved, "warp_lcp", curve.name, knob, h))
@@ -194,12 +199,12 @@ def theirs_at(
             try:
                 if expected > PATIENCE:
                     raise Refused(f"a run would take {expected:.0f} s")
-                whole = each.make(variant, scene, case.every(h))
+                whole = each.make(variant, scene, case.every(h), timed=False)
                 known[name, variant] = whole.recorded_s / (scene.steps * scene.envs)
                 problems = compare.problems(scene, whole)
                 whole.drop()
                 short = part(case, h, known[name, variant])
-                timed = each.make(variant, short)
+                timed = each.make(variant, short, 1 if energy_error.defined(short) else short.steps)
             except (Refused, PeerError) as why:
                 if each.process.poll() is not None:
                     raise

@@ -96,10 +96,10 @@ def panel(axis: Any, rows: list[dict[str, Any]], key: str, least: float, titles:
 
 
 def draw(rows: list[dict[str, Any]], path: Path, key: str = "error") -> list[Path]:
-    """The chart: a panel for each case and a summary; key 'error' or 'E_uc'."""
+    """The chart: a panel for each case that has the key, 'error' or 'E_uc', and a summary."""
     plt = pyplot(**STYLE)
-    good = [row for row in rows if counts(row)]
-    cases = list(dict.fromkeys(row["case"] for row in rows))
+    good = [row for row in rows if counts(row) and row.get(key) is not None]
+    cases = [name for name in dict.fromkeys(row["case"] for row in rows) if key == "error" or name in {row["case"] for row in good}]
     columns = 3
     lines = -(-(len(cases) + 1) // columns)
     figure, axes = plt.subplots(lines, columns, figsize=(13.0, 4.2 * lines + 1.2), squeeze=False)

@@ -10,7 +10,7 @@ in J, where E_uc is the unit-consistent error of Enzenhoefer, Peiret and others 
 1/2 m_t |(r_t - P_disc(r_t - m_t u_t)) / m_t|^2 with the contacts' effective masses m_n, m_t). It is zero for a step that obeys both
 laws, and for no other; it needs no impulse of the engine's own. A local search from two starts finds it: an upper bound. Contacts are
 those that our collision detection finds at the state before the step; an open one has u_n + gap / h for u_n, as it may close.
-There is no restitution in it.
+There is no restitution in it, and no joint: it is defined for free bodies alone.
 """
 
 from __future__ import annotations
@@ -24,6 +24,11 @@ from .motion import Motion
 from .scenes import Scene
 
 FIRST, SPREAD = 6, 10  # steps: the first ones, where convex laws throw a body that slides, and others over the motion
+
+
+def defined(scene: Scene) -> bool:
+    """Are there free bodies alone, without restitution?"""
+    return scene.made is None and not scene.restitution
 
 
 @dataclass(frozen=True)

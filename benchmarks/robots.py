@@ -21,6 +21,8 @@ USD = ROOT.parent / "shared" / "usd"  # robots made by others; the README there 
 #: What adapters read of a Model under its own names (adapters/protocol.py, Tree).
 TREE = ["body_parent", "joint_type", "joint_pose", "joint_child_pose", "q_start", "v_start", "dof_body", "dof_kind", "dof_axis"]
 TREE += ["armature", "damping", "joint_friction", "limit", "drive", "com", "pairs"]
+#: What they read of its loops, and the shape of one loop's.
+LOOPS = {"bodies": (2,), "frames": (2, 7), "ways": (3,), "turns": (3,)}
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class Robot:
         model: the robot and the ground.
         dt: step [s]. steps: number of steps.
         q, v: [E, nq], [E, nv] start.
+        wrench: [B, 6] constant force [N] at the centre of mass and torque [N m], world axes; None: none.
     """
 
     name: str
@@ -41,6 +44,7 @@ class Robot:
     q: np.ndarray
     v: np.ndarray
     restitution: float = 0.0
+    wrench: np.ndarray | None = None
 
     @property
     def envs(self) -> int:
@@ -78,17 +82,22 @@ class Robot:
         return self.simulator(device="cpu").body_velocity.numpy().copy()
 
     def save(self, path: Path) -> None:
-        """What an adapter reads: as Scene.save, with full inertias [B, 3, 3], and what TREE names, q and v."""
+        """What an adapter reads: as Scene.save, with full inertias [B, 3, 3], and what TREE names, loop_ and what LOOPS names, q and v.
+
+        Raises:
+            ValueError: for distances that are held.
+        """
         model, sim = self.model, self.simulator(device="cpu")
-        if model.loops:
-            raise ValueError(f"{self.name}: adapters know no loops, and {model.loops[0].name} is one")
+        if held := [loop.name for loop in model.loops if loop.distance is not None]:
+            raise ValueError(f"{self.name}: adapters know no distances, and {held[0]} is one")
         np.savez(
             path,
             shape_kind=np.array([wl.ShapeType(kind).name.lower() for kind in model.shape_type]),
             **{name: getattr(model, name) for name in ("shape_body", "shape_size", "shape_pose", "mass", "inertia", "gravity", *TREE)},
             pose=sim.body_pose.numpy(),
+            **{f"loop_{name}": np.array([getattr(x, name) for x in model.loops]).reshape(-1, *size) for name, size in LOOPS.items()},
             velocity=sim.body_velocity.numpy(),
-            wrench=np.zeros((model.num_bodies, 6)),
+            wrench=np.zeros((model.num_bodies, 6)) if self.wrench is None else self.wrench,
             q=self.q,
             v=self.v,
         )
@@ -98,18 +107,14 @@ def of_scene(scene: Scene) -> Robot:
     """A scene that carries its own model, as other engines are told of robots.
 
     Raises:
-        ValueError: for what adapters are not told: kinematic bodies, belts, constant forces, joints that close loops.
+        ValueError: for what adapters are not told: kinematic bodies and belts.
     """
     model = scene.made
     assert model is not None
-    if model.loops:
-        raise ValueError(f"{scene.name}: adapters know no loops, and {model.loops[0].name} is one")
     if (model.dof_kind == DofKind.PRESCRIBED).any() or model.shape_surface_velocity.any():
         raise ValueError(f"{scene.name}: adapters know no bodies and surfaces that move by themselves")
-    if scene.wrench is not None:
-        raise ValueError(f"{scene.name}: adapters of robots know no constant forces")
     q, v = (np.tile(x, (scene.envs, 1)) for x in (model.q0, model.v0))
-    robot = Robot(scene.name, model, scene.dt, scene.steps, q, v, scene.restitution)
+    robot = Robot(scene.name, model, scene.dt, scene.steps, q, v, scene.restitution, scene.wrench)
     _ = robot.friction  # one coefficient
     return robot
 

@@ -4,6 +4,7 @@
 import json
 import sys
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from test_benchmarks import FAKE
 
 from benchmarks import __main__ as command
-from benchmarks import accuracy, chart, chart_picture, peers, pictures, regression, report, stability, stability_picture
+from benchmarks import accuracy, chart, chart_picture, motion, peers, pictures, regression, report, stability, stability_picture
 from benchmarks.cases import CASES
 
 ROOT = Path(__file__).parents[1]
@@ -109,6 +110,29 @@ def test_measured_points(fake, tmp_path, monkeypatch):
     for row in (*mine.values(), theirs["plain"]):
         assert row["per_ms_us"] == pytest.approx(1e6 * row["step_s"] / 10.0)
         assert row["step_s"] > 0.0
+
+
+def test_scenes_with_joints_in_the_chart():
+    """The timed part of the stop starts where it lies on it; E_uc is that of free bodies; midpoint says that it knows no joints."""
+    case = CASES["stop"]
+    short = chart.part(case, 1e-2)
+    lies = np.arctan2(-short.pose[0, 0, 2], short.pose[0, 0, 0])
+    assert lies == pytest.approx(np.pi / 3, abs=1e-6)
+    moved = motion.simulate(replace(short, steps=5), device="cpu")
+    assert np.abs(moved.pose - short.pose[0]).max() < 1e-6
+    assert chart.energy_errors(moved) == {"E_uc": None}
+    rows, clocks = chart.ours_at(case, 1e-2, "cpu")
+    assert [row["setting"] for row in rows if "left_out" in row] == ["midpoint"]
+    assert len(clocks) == len(rows) - 1
+
+
+def test_no_panel_without_a_number(tmp_path):
+    """Of a case that has no E_uc."""
+    pytest.importorskip("matplotlib")
+    rows = [point(), point("drake", "sap"), point(case="stop", E_uc=None), point("drake", "sap", case="stop", E_uc=None)]
+    for key, points in (("error", 4), ("E_uc", 2)):
+        _, svg = chart_picture.draw(rows, tmp_path / key, key)
+        assert len([1 for element in ElementTree.parse(svg).iter(f"{{{pictures.SVG}}}title") if "us/ms" in (element.text or "")]) == points
 
 
 def test_picture(tmp_path):

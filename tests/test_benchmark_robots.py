@@ -12,8 +12,9 @@ from test_benchmarks import fake, folder  # noqa: F401
 from test_joints import moved, pendulum, poses, quadruped, random_state, random_tree
 
 import warp_lcp as wl
-from benchmarks import dynamics, peers, regression, robot_speed, robots
+from benchmarks import dynamics, motion, peers, regression, robot_speed, robots
 from benchmarks.cases import CASES
+from benchmarks.peers import compare
 from benchmarks.peers.session import session
 from warp_lcp.model import DofKind, Drive, JointType
 
@@ -39,7 +40,8 @@ def robot(model: wl.Model, envs: int = 3) -> robots.Robot:
 
 
 def test_adapters_read_what_is_written():
-    assert {field.name for field in fields(protocol.Tree)} == {*robots.TREE, "q", "v"}
+    loops = {f"loop_{name}" for name in robots.LOOPS}
+    assert {field.name for field in fields(protocol.Tree)} == {*robots.TREE, *loops, "q", "v"}
 
 
 def test_map_to_the_velocities_of_mujoco(tmp_path):
@@ -123,18 +125,79 @@ def test_drives_of_limited_force_are_actuators(tmp_path):
     assert ElementTree.fromstring(text).find("option").get("integrator") == "implicitfast"
 
 
+def looped(ways=(True, True, True), turns=(False, True, True)) -> wl.Model:
+    """The model of the four-bar, its loop closed by another joint."""
+    model = CASES["fourbar"].scene(1e-3).made
+    return replace(model, loops=(replace(model.loops[0], ways=ways, turns=turns),))
+
+
+def test_loops_in_mjcf(tmp_path):
+    """A ball is one point, a weld a frame, a hinge two points of its axis; both sides are where the mechanism closes."""
+    for turns, kinds in (((False,) * 3, ["connect"]), ((True,) * 3, ["weld"]), ((False, True, True), ["connect", "connect"])):
+        tree = ElementTree.fromstring(mjcf.model(job(robot(looped(turns=turns), 1), tmp_path)))
+        assert [element.tag for element in tree.find("equality")] == kinds
+        assert len(tree.findall(".//site")) == 2 * len(kinds)
+        assert tree.find(".//body[@name='b1']/site").get("name") == "a0"
+    with pytest.raises(protocol.Refused, match="balls, hinges and welds"):
+        mjcf.model(job(robot(looped(turns=(True, False, False)), 1), tmp_path))
+    told = job(robots.of_scene(CASES["fourbar"].scene(1e-3)), tmp_path)
+    for _, bodies, frames in mjcf.closures(told.tree):
+        ends = [told.pose[0, body, :3] + mjcf.rotate(told.pose[0, body, 3:], place[:3]) for body, place in zip(bodies, frames, strict=True)]
+        assert np.abs(ends[0] - ends[1]).max() < 1e-9
+
+
+def test_stiff_settings_are_those_of_limits_and_loops(tmp_path):
+    made = job(robot(looped(), 1), tmp_path)
+    made.settings["time_constant_steps"] = 2
+    tree = ElementTree.fromstring(mjcf.model(made))
+    assert tree.find("equality/connect").get("solref") == tree.find("default/joint").get("solreflimit") == "0.002 1"
+
+
+def test_constant_forces_on_trees(tmp_path):
+    scene = CASES["wedge_slips"].scene(1e-3)
+    assert np.array_equal(job(robots.of_scene(scene), tmp_path).wrench, scene.wrench)
+
+
+@pytest.mark.parametrize(
+    ("name", "variant", "most"),
+    [
+        ("mujoco", "elliptic, stiff, RK4", 1e-3),
+        ("drake", "sap", 1e-2),
+        pytest.param("mujoco_warp", "elliptic, stiff, RK4", 1e-3, marks=pytest.mark.slow),
+        pytest.param("newton_steel", "12 sweeps", 1e-2, marks=pytest.mark.slow),
+        pytest.param("newton_lox", "200 iterations", 1e-2, marks=pytest.mark.slow),
+    ],
+)
+def test_a_loop_and_a_force_in_other_engines(name, variant, most):
+    """The four-bar's crank is after 0.2 s where Lagrange's equation has it, and again; a jaw is pushed as far as by us."""
+    peer = peers.PEERS[name]
+    if not peer.installed(peers.FOLDER):
+        pytest.skip("the peer's interpreter is not installed")
+    bars = replace(CASES["fourbar"].scene(1e-3), steps=200)
+    wedge = CASES["wedge_slips"].scene(1e-3)
+    alone = replace(wedge, steps=100, made=replace(wedge.made, pairs=wedge.made.pairs[:0]))
+    with session(peer, peers.FOLDER) as running:
+        for scene in (bars, alone):
+            fine = replace(scene, dt=1e-4, steps=10 * scene.steps)
+            expected = motion.simulate(fine, fine.steps, device="cpu").pose[-1, 0, :, :3]
+            task = running.make(variant, scene, scene.steps)
+            assert np.abs(task.pose[-1, 0, :, :3] - expected).max() < most
+            task.repeat()
+            assert task.same
+            assert compare.problems(scene, task) == []
+
+
 def test_scenes_with_joints_are_robots_to_others():
-    """Where they have nothing that adapters are not told: joints that close loops, belts, constant forces."""
+    """Where they have nothing that adapters are not told: belts."""
     chain = CASES["chain"].scene(1e-3, 2)
     told = robots.of_scene(chain)
     assert told.q.shape == (2, chain.made.nq)
     assert np.abs(told.pose - chain.pose).max() < 1e-12
-    for name, why in (("fourbar", "loops"), ("stick_slip", "move by themselves"), ("wedge_jams", "constant forces")):
-        with pytest.raises(ValueError, match=why):
-            robots.of_scene(CASES[name].scene(1e-3, 1))
+    with pytest.raises(ValueError, match="move by themselves"):
+        robots.of_scene(CASES["stick_slip"].scene(1e-3, 1))
 
 
-def test_loops_and_unequal_friction_are_no_jobs(tmp_path):
+def test_distances_and_unequal_friction_are_no_jobs(tmp_path):
     builder = wl.ModelBuilder()
     builder.add_sphere(builder.add_body(), 0.1)
     builder.add_plane(material=wl.Material(0.7, 0.7))

@@ -122,7 +122,8 @@ def test_several_jobs_in_one_process(folder):
 def test_adapter_alone(folder):
     """Orders on stdin, replies on stdout, the engine's own prints on stderr."""
     scene().save(folder / "state.npz")
-    job = {"scene": "slide", "dt": 1e-3, "steps": 10, "every": 1, "friction": 1.0, "restitution": 0.0, "settings": {}}
+    job = {"scene": "slide", "dt": 1e-3, "steps": 10, "every": 1, "timed": True}
+    job |= {"friction": 1.0, "restitution": 0.0, "settings": {}}
     job |= {"state": str(folder / "state.npz"), "result": str(folder / "result.npz")}
     orders = [{"do": "make", "id": "a", "job": job}, {"do": "run", "id": "a"}, {"do": "drop", "id": "a"}]
     text = "".join(json.dumps(order) + "\n" for order in orders)

@@ -229,8 +229,8 @@ def test_what_only_a_model_says_is_refused_to_other_engines(tmp_path):
     from benchmarks.peers.session import Refused, Session
 
     peer = next(iter(PEERS.values()))
-    with pytest.raises(Refused, match=f"{peer.name}, fourbar: adapters know no loops"):
-        Session(peer, None, tmp_path).make(next(iter(peer.variants)), CASES["fourbar"].scene(1e-3))
+    with pytest.raises(Refused, match=f"{peer.name}, stick_slip: adapters know no bodies and surfaces that move"):
+        Session(peer, None, tmp_path).make(next(iter(peer.variants)), CASES["stick_slip"].scene(1e-3))
 
 
 def test_accuracy_without_the_midpoint_rule():

@@ -99,6 +99,7 @@ PEERS = {
                 "elliptic, noslip": {"cone": "elliptic", "noslip_iterations": 10},
                 "elliptic, stiff": {"cone": "elliptic"} | STIFF,
                 "elliptic, stiff, noslip": {"cone": "elliptic", **STIFF, "noslip_iterations": 10},
+                "elliptic, stiff, RK4": {"cone": "elliptic", **STIFF, "integrator": "RK4"},
             },
         ),
         Peer(
@@ -109,6 +110,7 @@ PEERS = {
                 "pyramidal": {"cone": "pyramidal"},
                 "elliptic": {"cone": "elliptic"},
                 "elliptic, stiff": {"cone": "elliptic"} | STIFF,
+                "elliptic, stiff, RK4": {"cone": "elliptic", **STIFF, "integrator": "RK4"},
             },
         ),
         Peer(

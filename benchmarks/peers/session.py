@@ -110,8 +110,8 @@ class Session:
             raise PeerError(f"{self.peer.name}, {what}: {reply['error']}")
         return reply
 
-    def make(self, variant: str, scene: Scene | Robot, every: int = 1) -> Task:
-        """Let the peer simulate a scene once, not timed, with a sample after every so many steps."""
+    def make(self, variant: str, scene: Scene | Robot, every: int = 1, timed: bool = True) -> Task:
+        """Let the peer simulate a scene once, not timed, with a sample after every so many steps; timed: repeat() will be called."""
         if isinstance(scene, Scene) and scene.made is not None:
             try:
                 scene = of_scene(scene)
@@ -121,7 +121,14 @@ class Session:
         state, result = self.work / f"state{index}.npz", self.work / f"result{index}.npz"
         scene.save(state)
         job = {name: getattr(scene, name) for name in ("dt", "steps", "friction", "restitution")}
-        job |= {"scene": scene.name, "every": every, "settings": self.peer.variants[variant], "state": str(state), "result": str(result)}
+        job |= {
+            "scene": scene.name,
+            "every": every,
+            "timed": timed,
+            "settings": self.peer.variants[variant],
+            "state": str(state),
+            "result": str(result),
+        }
         reply = self.order({"do": "make", "id": index, "job": job}, variant)
         with np.load(result) as arrays:
             states = {name: arrays[name] for name in ("pose", "velocity", "before_pose", "before_velocity")}

@@ -14,10 +14,10 @@ and B is the identity elsewhere, but for the axes of a ball. M' and c' of M' dqv
 from __future__ import annotations
 
 import numpy as np
-from protocol import Job, Refused, Tree
+from protocol import Job, Refused, Tree, closure
 
 #: Settings that are attributes of <option>.
-OPTIONS = ("cone", "impratio", "iterations", "tolerance", "noslip_iterations", "noslip_tolerance", "solver")
+OPTIONS = ("integrator", "cone", "impratio", "iterations", "tolerance", "noslip_iterations", "noslip_tolerance", "solver")
 # warp_lcp.JointType and DofKind
 FREE, KINEMATIC, SPHERICAL = 0, 1, 5
 LINEAR, BALL_ON = 0, 3
@@ -36,17 +36,23 @@ def place(pose: np.ndarray) -> str:
 def model(job: Job) -> str:
     """MJCF of one environment. Bodies have the name b<index>, joints come in the order of their coordinates.
 
-    Settings: those of OPTIONS, and time_constant_steps, the time constant of every contact in steps (absent: 20 ms).
+    Settings: those of OPTIONS, and time_constant_steps, the time constant of contacts, limits and loops in steps (absent: 20 ms).
     """
     if job.restitution:
         raise Refused("MuJoCo has no coefficient of restitution")
-    surface = f'condim="3" friction="{job.friction} 0.005 0.0001"' + (
-        f' solref="{s * job.dt} 1"' if (s := job.settings.get("time_constant_steps")) else ""
-    )
+    steps = job.settings.get("time_constant_steps")
+    spring = f'solref="{steps * job.dt} 1"' if steps else ""
+    surface = f'condim="3" friction="{job.friction} 0.005 0.0001" {spring}'
+    stops = f"<default><joint {spring.replace('solref', 'solreflimit')}/></default>" if steps and job.tree is not None else ""
     geoms: dict[int, str] = dict.fromkeys(range(-1, len(job.mass)), "")
     for kind, body, size, pose in zip(job.shape_kind, job.shape_body, job.shape_size, job.shape_pose, strict=True):
         extent = numbers({"plane": np.array([0.0, 0.0, 1.0]), "box": size, "sphere": size[:1]}.get(kind, size[:2]))
         geoms[body] += f'<geom type="{kind}" size="{extent}" {place(pose)} {surface}/>'
+    closed = ""
+    for i, (kind, bodies, poses) in enumerate([] if job.tree is None else closures(job.tree)):
+        for side, body, pose in zip("ab", bodies, poses, strict=True):
+            geoms[body] += f'<site name="{side}{i}" {place(pose)}/>'
+        closed += f'<{kind} site1="a{i}" site2="b{i}" {spring}/>'
     children: dict[int, list[int]] = {}
     for body in range(len(job.mass)):
         children.setdefault(-1 if job.tree is None else int(job.tree.body_parent[body]), []).append(body)
@@ -64,7 +70,8 @@ def model(job: Job) -> str:
     options = " ".join(f'{key}="{value}"' for key, value in (rule | {k: job.settings[k] for k in OPTIONS if k in job.settings}).items())
     return (
         f'<mujoco><compiler angle="radian"/><option timestep="{job.dt}" gravity="{numbers(job.gravity)}" {options}>'
-        f'<flag filterparent="disable"/></option><worldbody>{geoms[-1]}{nested(-1)}</worldbody>{excluded(job)}{drives}</mujoco>'
+        f'<flag filterparent="disable"/></option>{stops}<worldbody>{geoms[-1]}{nested(-1)}</worldbody>{excluded(job)}{drives}'
+        + (f"<equality>{closed}</equality></mujoco>" if closed else "</mujoco>")
     )
 
 
@@ -131,6 +138,26 @@ def actuators(tree: Tree | None) -> str:
             bias = numbers(np.array([stiffness * target + damping * target_velocity, -stiffness, -damping]))
             lines += f'<general joint="j{i}" gaintype="fixed" gainprm="0" biastype="affine" biasprm="{bias}" {limited}/>'
     return f"<actuator>{lines}</actuator>" if lines else ""
+
+
+def closures(tree: Tree) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """What closes a tree's loops: connect or weld, the bodies [2] and the poses [2, 7] in them that are held together.
+
+    A hinge is a ball at either end of a piece of its axis, as long as its second body's centre of mass is away: there is none besides.
+    """
+    found = []
+    for i, (bodies, frames) in enumerate(zip(tree.loop_bodies, tree.loop_frames, strict=True)):
+        kind = closure(tree, i)
+        if kind != "hinge":
+            found.append(("weld" if kind == "weld" else "connect", bodies, frames))
+            continue
+        reach = np.linalg.norm(frames[1, :3] - (tree.com[bodies[1]] if bodies[1] >= 0 else 0.0)) or 0.1
+        axis = np.where(tree.loop_turns[i], 0.0, 0.5 * reach)
+        for side in (1.0, -1.0):
+            ends = frames.copy()
+            ends[:, :3] += side * rotate(frames[:, 3:], axis)
+            found.append(("connect", bodies, ends))
+    return found
 
 
 def excluded(job: Job) -> str:

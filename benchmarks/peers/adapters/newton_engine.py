@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from itertools import pairwise
 from typing import Any
 
 import newton
@@ -13,12 +14,19 @@ import warp as wp
 
 GENEROUS = 16  # contacts for each body in the run that finds how many are needed
 # warp_lcp.JointType and DofKind
-FREE, FIXED, SPHERICAL, LINEAR = 0, 2, 5, 0
+FREE, FIXED, SPHERICAL = 0, 2, 5
+LINEAR, ANGULAR = 0, 1
 GAP = 0.005  # m, of each shape; or what the fastest body moves in a step, where that is more (Newton's own default is 0.1 m)
 
 
 class NewtonEngine(protocol.Engine):
-    """Two states in turn; a graph of one step in either direction. A solver's adapter says how it is made."""
+    """Two states in turn; a graph of one step in either direction. A solver's adapter says how it is made.
+
+    Attributes:
+        knows: what of a joint's "force" limit, dry "friction" and "damping" beside a drive the solver looks at.
+    """
+
+    knows: frozenset[str] = frozenset()
 
     def __init__(self, job: protocol.Job):
         wp.set_device("cpu")
@@ -67,21 +75,56 @@ class NewtonEngine(protocol.Engine):
                 found.append(world.add_joint_prismatic(axis=axes[True][0], **where))
             else:
                 found.append(world.add_joint_d6(linear_axes=axes[True], angular_axes=axes[False], **where))
-        world.add_articulation(found)
+        cut = [0, *self.cuts(tree), len(found)]
+        for begin, end in pairwise(cut):
+            world.add_articulation(found[begin:end])
+        self.close(world, tree)
+
+    @staticmethod
+    def cuts(tree: protocol.Tree) -> list[int]:
+        """Where in the order of coordinates an articulation ends: neither a joint nor a loop reaches from before to behind."""
+        rank = np.argsort(np.argsort(tree.q_start, kind="stable")).tolist()
+        pairs = [(body, parent) for body, parent in enumerate(tree.body_parent.tolist())] + tree.loop_bodies.tolist()
+        spans = [sorted((rank[a], rank[b])) for a, b in pairs if min(a, b) >= 0]
+        return [k for k in range(1, len(rank)) if not any(low < k <= high for low, high in spans)]
+
+    @staticmethod
+    def close(world: newton.ModelBuilder, tree: protocol.Tree) -> None:
+        """Joints outside every articulation close loops; their child is a body."""
+        for i, (bodies, frames) in enumerate(zip(tree.loop_bodies.tolist(), tree.loop_frames, strict=True)):
+            (parent, parent_frame), (child, child_frame) = sorted(zip(bodies, frames, strict=True), key=lambda side: side[0] >= 0)
+            where = {"parent": parent, "child": child}
+            where |= {"parent_xform": wp.transform(*parent_frame.tolist()), "child_xform": wp.transform(*child_frame.tolist())}
+            kind = protocol.closure(tree, i)
+            if kind == "ball":
+                world.add_joint_ball(**where)
+            elif kind == "hinge":
+                world.add_joint_revolute(axis=wp.vec3(*np.where(tree.loop_turns[i], 0.0, 1.0).tolist()), **where)
+            else:
+                world.add_joint_fixed(**where)
 
     def axis(self, tree: protocol.Tree, i: int) -> newton.ModelBuilder.JointDofConfig:
-        """A coordinate's limits and drive."""
+        """A coordinate's limits and drive; a solver that knows no damping has it as a part of the drive, whose target moves slower then."""
         stiffness, damping, force, target, target_velocity = tree.drive[i].tolist()
-        driven = bool(stiffness or damping)
-        if tree.joint_friction[i] or (driven and (np.isfinite(force) or target_velocity)):
-            raise protocol.Refused("drives of limited force or with a target velocity, and dry friction, are not written for Newton")
+        asked = {"force": (stiffness or damping) and np.isfinite(force), "friction": tree.joint_friction[i]}
+        for name, value in asked.items():
+            if value and name not in self.knows:
+                raise protocol.Refused(f"this solver has no {'drives of limited force' if name == 'force' else 'dry friction of joints'}")
+        passive = float(tree.damping[i])
+        if passive and "damping" not in self.knows:
+            target_velocity *= damping / (damping + passive)
+            damping, passive = damping + passive, 0.0
         limits = {name: float(x) for name, x in zip(("limit_lower", "limit_upper"), tree.limit[i], strict=True) if np.isfinite(x)}
         return newton.ModelBuilder.JointDofConfig(
             axis=wp.vec3(*tree.dof_axis[i].tolist()),
             armature=float(tree.armature[i]),
             target_q=target,
+            target_qd=target_velocity,
             target_ke=stiffness,
-            target_kd=damping + float(tree.damping[i]),
+            target_kd=damping,
+            damping=passive,
+            friction=float(tree.joint_friction[i]),
+            **({"effort_limit": force} if np.isfinite(force) else {}),
             **limits,
         )
 
@@ -118,23 +161,23 @@ class NewtonEngine(protocol.Engine):
                 target.add_shape_cylinder(radius=size[0], half_height=size[1], **place)
             else:
                 target.add_shape_capsule(radius=size[0], half_height=size[1], **place)
-        if job.tree is not None:
-            self.filter(world, job)
         builder.replicate(world, job.envs)
+        if job.tree is not None:
+            self.filter(builder, job)
         return builder.finalize(device="cpu")
 
     @staticmethod
-    def filter(world: newton.ModelBuilder, job: protocol.Job) -> None:
-        """Shapes of the robot that pass through each other; with the world's all of them touch."""
+    def filter(builder: newton.ModelBuilder, job: protocol.Job) -> None:
+        """Shapes that pass through each other. The world's come first, then those of the bodies, once for each environment."""
         touching = {frozenset(pair) for pair in job.tree.pairs.tolist()}
-        own = [i for i, body in enumerate(job.shape_body) if body >= 0]  # in the order of the world's shapes
+        own = [i for i, body in enumerate(job.shape_body) if body >= 0]
         static = [i for i, body in enumerate(job.shape_body) if body < 0]
-        if any(frozenset((i, j)) not in touching for i in own for j in static):
-            raise protocol.Refused("shapes that pass through the world are not written for Newton")
-        for b, j in enumerate(own):
-            for a, i in enumerate(own[:b]):
-                if frozenset((i, j)) not in touching:
-                    world.add_shape_collision_filter_pair(a, b)
+        for env in range(job.envs):
+            place = {i: k for k, i in enumerate(static)} | {i: len(static) + env * len(own) + k for k, i in enumerate(own)}
+            for b, j in enumerate(own):
+                for i in static + own[:b]:
+                    if frozenset((i, j)) not in touching:
+                        builder.add_shape_collision_filter_pair(place[i], place[j])
 
     def allocate(self, contacts: int) -> None:
         """A pipeline and a solver with room for this many contacts in all environments together, and graphs of their steps."""
@@ -169,8 +212,10 @@ class NewtonEngine(protocol.Engine):
         self.states[0].body_qd.assign(self.job.velocity.reshape(-1, 6))
         if self.job.tree is not None:  # bodies where the joints have them: a check of the joints that costs no step
             state, tree = self.states[0], self.job.tree
-            state.joint_q.assign(tree.q.reshape(-1))
-            state.joint_qd.assign(tree.v.reshape(-1))
+            for array, own in ((state.joint_q, tree.q), (state.joint_qd, tree.v)):  # those of joints that close loops are behind
+                values = array.numpy().reshape(self.job.envs, -1).copy()
+                values[:, : own.shape[1]] = own
+                array.assign(values.reshape(-1))
             newton.eval_fk(self.model, state.joint_q, state.joint_qd, state)
 
     def run(self, steps: int) -> None:

@@ -43,8 +43,10 @@ class MuJoCoWarp(protocol.Engine):
         self.reset()
 
     def reset(self) -> None:
-        """reset_data clears the warm start too."""
+        """reset_data clears the warm start too, but not the velocities of the last step, which the rows of loops look at."""
         mjw.reset_data(self.model, self.data)
+        self.data.cvel.zero_()
+        self.data.cdof_dot.zero_()
         self.data.qpos.assign(self.qpos)
         self.data.qvel.assign(self.qvel)
         self.data.xfrc_applied.assign(self.applied)

@@ -7,8 +7,9 @@ from __future__ import annotations
 from typing import Any
 
 import newton
+import numpy as np
 import protocol
-from newton_engine import GENEROUS, NewtonEngine
+from newton_engine import ANGULAR, GENEROUS, LINEAR, NewtonEngine
 
 Kamino = newton.solvers.SolverKamino
 COLOURS = 4  # default of LOX, which gives fewer, and other results, where it has less room for contacts
@@ -17,10 +18,21 @@ COLOURS = 4  # default of LOX, which gives fewer, and other results, where it ha
 class NewtonKamino(NewtonEngine):
     """Maximal coordinates; the free joint of a body constrains nothing."""
 
+    knows = frozenset({"force", "friction", "damping"})
+
     def __init__(self, job: protocol.Job):
         self.fullest = 0  # contacts of the fullest environment so far
         self.room = max(len(job.mass), 1) * GENEROUS
         super().__init__(job)
+
+    def joints(self, world: newton.ModelBuilder, tree: protocol.Tree) -> None:
+        """It has some of the joints that a D6 can be, and none of two ways, or of a way and more than one angle."""
+        for body in range(len(tree.body_parent)):
+            ways = int(np.count_nonzero((tree.dof_body == body) & (tree.dof_kind == LINEAR)))
+            angles = int(np.count_nonzero((tree.dof_body == body) & (tree.dof_kind == ANGULAR)))
+            if ways and (ways, angles) not in ((1, 0), (1, 1), (3, 0)):
+                raise protocol.Refused(f"Kamino has no joint of {ways} ways and {angles} angles")
+        super().joints(world, tree)
 
     def register(self, builder: newton.ModelBuilder) -> None:
         """Attributes of its states."""

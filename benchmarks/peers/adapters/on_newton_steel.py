@@ -7,6 +7,7 @@ from __future__ import annotations
 from typing import Any
 
 import newton
+import numpy as np
 import protocol
 from newton_engine import GENEROUS, NewtonEngine
 
@@ -15,6 +16,8 @@ ROWS = 5  # for a contact: its normal and, where it stands alone, two friction a
 
 class NewtonSteel(NewtonEngine):
     """Reduced coordinates: a free joint's are the pose of its body and the velocity of the centre of mass."""
+
+    knows = frozenset({"force", "damping"})  # and dry friction on CUDA alone
 
     def __init__(self, job: protocol.Job):
         self.rows = 0  # of an environment; 0: not known yet
@@ -37,7 +40,9 @@ class NewtonSteel(NewtonEngine):
         rows = self.rows or ROWS * GENEROUS * max(len(self.job.mass), 1)
         options = {"free_body_constraint_max": rows}
         if self.job.tree is not None:
-            options = {"articulation_constraint_max": rows, "free_body_constraint_max": 1, "enable_joint_limits": True}
+            options |= {"articulation_constraint_max": rows, "enable_joint_limits": True}
+            if (self.job.tree.drive[:, 0:2].any(axis=1) & np.isfinite(self.job.tree.drive[:, 2])).any():
+                options["drive_mode"] = "rows"  # by default, a part of a drive's force is not limited
         return newton.solvers.SolverSteel(self.model, row_watermark=self.rows == 0, **options, **self.job.settings)
 
     def reset(self) -> None:
@@ -50,8 +55,8 @@ class NewtonSteel(NewtonEngine):
 
     def settle(self) -> None:
         """As many rows as the fullest environment had."""
-        family = "free_body" if self.job.tree is None else "articulation"
-        self.rows = max(self.engine.constraint_row_watermarks()[f"{family}_raw_high_water"], 1)
+        found = self.engine.constraint_row_watermarks()
+        self.rows = max(1, *(found[f"{family}_raw_high_water"] for family in ("free_body", "articulation")))
         super().settle()
 
     def info(self) -> dict[str, Any]:

@@ -3,9 +3,10 @@
 
 Orders, each with the "id" of a job that the caller chooses:
 
-    {"do": "make", "id", "job": {scene, dt, steps, every, friction, restitution, settings, state, result}}
-        Build the engine and run the job once, with everything recorded. `state` is the .npz that benchmarks.scenes.Scene.save
-        or, with joints, benchmarks.robots.Robot.save writes. The reply is {info, seconds: of the run}; the .npz `result` holds
+    {"do": "make", "id", "job": {scene, dt, steps, every, timed, friction, restitution, settings, state, result}}
+        Build the engine and run the job once, with everything recorded; `timed` says whether it will be run again. `state` is the
+        .npz that benchmarks.scenes.Scene.save or, with joints, benchmarks.robots.Robot.save writes. The reply is {info, seconds: of
+        the run}; the .npz `result` holds
         pose [T, E, B, 7] (x y z qx qy qz qw) and velocity [T, E, B, 6] (linear of the centre of mass, then angular; world axes)
         at the start and after every `every` steps, as the engine gives them back, before_pose and before_velocity
         [T - 1, E, B, ..], one step before each of the later samples, and contacts, their mean number in an environment and a step.
@@ -46,7 +47,8 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Tree:
-    """Joints of a robot: fields of warp_lcp's Model under their names, its start in its coordinates, q [E, nq] and v [E, nv]."""
+    """Joints of a robot: fields of warp_lcp's Model under their names, those of its L loops as loop_ and their names (bodies [L, 2],
+    frames [L, 2, 7], ways and turns [L, 3]), its start in its coordinates, q [E, nq] and v [E, nv]."""
 
     body_parent: np.ndarray
     joint_type: np.ndarray
@@ -64,6 +66,10 @@ class Tree:
     drive: np.ndarray
     com: np.ndarray
     pairs: np.ndarray
+    loop_bodies: np.ndarray
+    loop_frames: np.ndarray
+    loop_ways: np.ndarray
+    loop_turns: np.ndarray
     q: np.ndarray
     v: np.ndarray
 
@@ -102,6 +108,19 @@ class Job:
     def envs(self) -> int:
         """Number of environments."""
         return len(self.pose)
+
+
+def closure(tree: Tree, loop: int) -> str:
+    """What closes a loop: a "ball", a "hinge" about one axis of its frames, or a "weld".
+
+    Raises:
+        Refused: for any other joint.
+    """
+    kinds = {0: "ball", 2: "hinge", 3: "weld"}
+    turns = int(tree.loop_turns[loop].sum())
+    if not tree.loop_ways[loop].all() or turns not in kinds:
+        raise Refused("loops are closed by balls, hinges and welds")
+    return kinds[turns]
 
 
 class Engine(ABC):
@@ -176,7 +195,8 @@ def make(order: dict[str, Any], build: Callable[[Job], Engine]) -> tuple[Engine,
     begin = time.perf_counter()
     result = engine.record()
     seconds, info = time.perf_counter() - begin, engine.info()
-    engine.settle()
+    if order["job"]["timed"]:
+        engine.settle()
     np.savez(order["job"]["result"], **result)
     return engine, result["pose"][-1], {"info": info, "seconds": seconds}
 
