@@ -61,6 +61,8 @@ STIFF = wp.constant(0.01)
 # ... and where it is more than this part, the velocity is damped by this part of h times the stiffness.
 UNRESOLVED = wp.constant(1.0)
 CALM = wp.constant(0.1)
+# What rows changed a step ago they are expected to change again, unless it was more than this part of the largest velocity.
+LASTING = wp.constant(0.25)
 # Where a step does not resolve c, M_ii is this part larger for joints, which takes a third of their velocity.
 SLOWED = wp.constant(0.5)
 
@@ -139,6 +141,8 @@ def functions(real) -> SimpleNamespace:
         calming: wp.array2d(dtype=real)  # [E, V] damping of what no step resolves, N s/m or N m s
         free: wp.array2d(dtype=real)  # [E, V] v_free
         change: wp.array2d(dtype=real)  # [E, V] v+ - v_free in the end; scratch of the solver
+        held: wp.array2d(dtype=real)  # [E, V] v+ - v_free of the step before
+        expected: wp.array2d(dtype=real)  # [E, V] v and half of what rows may change of it
         longest: int  # D
         half: wp.array2d(dtype=vec3)  # [E, 2 R D] D^-1/2 L^-T J^T of each contact and side, world axes, by depth
 
@@ -493,7 +497,7 @@ def make(real) -> SimpleNamespace:
     ):
         """trees.push := what gravity, wrenches and inertia give to each body within h [N s, N m s about O].
 
-        At the mean of v and v + trees.change, or at rest (part = 1, 0); its twists are trees.twist and trees.gained.
+        At v + trees.change / 2, or at rest (part = 1, 0); their twists are trees.twist and trees.gained.
         """
         gravity = parameters.gravity[env % parameters.gravity.shape[0]]
         for k in range(trees.order.shape[0]):
@@ -694,6 +698,36 @@ def make(real) -> SimpleNamespace:
                         mass[env, i, i] = real(1.0)
                         bias[env, i] = real(0.0)
 
+    @wp.func
+    def expect(trees: Trees, v: wp.array2d(dtype=real), env: int) -> real:
+        """trees.expected := v and half of what rows changed of it a step ago, trees.twist with that; returns the largest of v.
+
+        Loops and contacts that last change as much again, and c is that of the mean velocity of a step: of v and v+, not of v
+        and v_free. (A four-bar at 2 ms turns too far by 11 mrad in 2 s with the latter, by 0.02 with the former.) A hit does not.
+        """
+        n = trees.before.shape[0]
+        size = real(0.0)
+        changed = real(0.0)
+        for i in range(n):
+            size = wp.max(size, wp.abs(v[env, i]))
+            changed = wp.max(changed, wp.abs(trees.held[env, i]))
+        part = real(0.0)
+        if changed <= real(LASTING) * size:
+            part = real(0.5)
+        for i in range(n):
+            trees.expected[env, i] = v[env, i] + part * trees.held[env, i]
+        if part * changed > real(0.0):
+            for k in range(trees.order.shape[0]):
+                b = trees.order[k]
+                more = spatial()
+                if trees.parent[b] >= 0:
+                    more = trees.gained[env, trees.parent[b]]
+                for i in range(trees.first[b], trees.end[b]):
+                    more += (part * trees.held[env, i]) * trees.screw[env, i]
+                trees.gained[env, b] = more
+                trees.twist[env, b] = trees.twist[env, b] + more
+        return size
+
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def free_motion(
         topology: Topology,
@@ -709,12 +743,11 @@ def make(real) -> SimpleNamespace:
         start, _ = wp.tid()
         for env in range(start, wrench.shape[0], stride):
             n = trees.before.shape[0]
-            size = real(0.0)
+            size = expect(trees, v, env)
             for i in range(n):
                 trees.free[env, i] = v[env, i]
                 trees.change[env, i] = real(0.0)
                 trees.calming[env, i] = real(0.0)
-                size = wp.max(size, wp.abs(v[env, i]))
             for b in range(trees.order.shape[0]):
                 trees.gained[env, b] = spatial()
             impulses(trees, q, v, h, env)
@@ -727,7 +760,7 @@ def make(real) -> SimpleNamespace:
             before = real(0.0)
             whole = real(0.0)
             while searching:
-                forces(topology, parameters, trees, wrench, v, part, h, bodies, env)
+                forces(topology, parameters, trees, wrench, trees.expected, part, h, bodies, env)
                 if rounds == 1:
                     stiffer = matters(parameters, trees, bodies, h, env)
                     stale = stiffer
@@ -796,19 +829,41 @@ def make(real) -> SimpleNamespace:
         start, b = wp.tid()
         for env in range(start, q.shape[0], stride):
             for i in range(trees.first[b], trees.end[b]):
+                trees.held[env, i] = trees.change[env, i]
                 v[env, i] = trees.free[env, i] + trees.change[env, i]
             advance(topology, trees, bodies, v, h, q, env, b)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def drift(
+        topology: Topology,
+        trees: Trees,
+        bodies: Bodies,
+        h: real,
+        q: wp.array2d(dtype=real),
+        v: wp.array2d(dtype=real),
+        stride: int,
+    ):
+        """q + h Gamma(q) v."""
+        start, b = wp.tid()
+        for env in range(start, q.shape[0], stride):
+            advance(topology, trees, bodies, v, h, q, env, b)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def reset_control(mask: wp.array(dtype=wp.bool), target: wp.array(dtype=real), rate: wp.array(dtype=real), trees: Trees):
-        """Nothing is applied, and drives have the model's targets; launch with dim (E)."""
+        """Nothing is applied, nothing has held anything, and drives have the model's targets; launch with dim (E)."""
         env = wp.tid()
         if mask[env]:
             for i in range(trees.force.shape[1]):
+                trees.held[env, i] = real(0.0)
                 trees.force[env, i] = real(0.0)
                 trees.target[env, i] = target[i]
                 trees.target_rate[env, i] = rate[i]
 
     return SimpleNamespace(
-        kinematics=kinematics, free_motion=free_motion, integrate=integrate, reset_control=reset_control, dynamics=dynamics
+        kinematics=kinematics,
+        free_motion=free_motion,
+        integrate=integrate,
+        drift=drift,
+        reset_control=reset_control,
+        dynamics=dynamics,
     )

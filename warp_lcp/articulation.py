@@ -84,7 +84,7 @@ def layout(model: Model, real: Any) -> list[tuple[str, int, Any]]:
         ("articulated", b, wp.types.matrix(shape=(6, 6), dtype=real)),
         ("mass", b, real),
         ("screw taken", n, t.spatial),
-        ("pivot scale given calming free change target target_rate force", n, real),
+        ("pivot scale given calming free change held expected target target_rate force", n, real),
         ("row_scale", extra, t.vec3),
         ("half", 2 * (model.max_contacts + extra) * longest, t.vec3),
     )

@@ -182,8 +182,8 @@ class Simulator:
         _choice("method", method, tuple(METHODS))
         _choice("precision", precision, tuple(PRECISIONS))
         _choice("integrator", integrator, INTEGRATORS)
-        if model.articulated and integrator == "midpoint":
-            raise WarpLcpError("integrator 'midpoint' does not know joints yet; choose 'euler'")
+        if model.articulated and integrator == "midpoint" and project_loops:
+            raise WarpLcpError("project_loops is for integrator 'euler': with joints 'midpoint' closes loops half a step ahead")
         self.model, self.num_envs, self.dt = model, whole_number("num_envs", num_envs, 1), positive_number("dt", dt, "s")
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
@@ -462,7 +462,11 @@ class Simulator:
     def _step_kernels(self) -> None:
         """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back."""
         k, h, b, scene = self._kernels, self.dt, self.model.num_bodies, [self.topology, self.parameters]
+        halves = self.model.articulated and self.integrator == "midpoint"
         self._refresh_bodies()
+        if halves:
+            self.launch(k.drift, [self.topology, self.mechanics, self.bodies, 0.5 * h, self.q, self.v], b)
+            self._refresh_bodies()
         if self.model.articulated:
             self.launch(k.free_motion, [*scene, self.mechanics, self.wrench, self.q, self.v, h, self.bodies])
         else:
@@ -492,7 +496,7 @@ class Simulator:
         if self.bounces is not None:
             self._judge_kernels()
         if self.model.articulated:
-            self.launch(k.integrate, [self.topology, self.mechanics, self.bodies, h, self.q, self.v], b)
+            self.launch(k.integrate, [self.topology, self.mechanics, self.bodies, 0.5 * h if halves else h, self.q, self.v], b)
         elif self.integrator == "midpoint":
             self.launch(k.guard, [self.parameters, self.bodies, self.rows, self.next_velocity, h, self.tolerance, self.rounding])
             self.launch(k.integrate_midpoint, [*scene, self.bodies, self.next_velocity, self.wrench, h, self.q, self.v], b)
@@ -728,6 +732,8 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         stages.joint_rows = joint_rows.make(real)
     if model.articulated:
         stages.integrate, stages.reset_control = body.integrate, body.reset_control
+        if integrator == "midpoint":
+            stages.drift = body.drift
     elif integrator == "midpoint":
         stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
     else:
