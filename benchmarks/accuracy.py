@@ -36,12 +36,9 @@ def one(case: Case, steps: tuple[float, ...], device: Any) -> list[dict[str, Any
     """Every metric of a case under every law."""
     found: dict[str, list[dict[str, Any]]] = {law: [] for law in LAWS}
     for h in steps:
-        # The midpoint rule does not know joints.
-        laws = {law: options for law, options in LAWS.items() if law != "midpoint" or not case.scene(h).model().articulated}
-        runs = {law: case.simulate(h, device=device, **options) for law, options in laws.items()}
-        exact = dict.fromkeys(laws, runs["coulomb"])
-        if "midpoint" in laws:
-            exact["midpoint"] = case.simulate(h, device=device, **LAWS["midpoint"], **EXACT)
+        runs = {law: case.simulate(h, device=device, **options) for law, options in LAWS.items()}
+        exact = dict.fromkeys(LAWS, runs["coulomb"])
+        exact["midpoint"] = case.simulate(h, device=device, **LAWS["midpoint"], **EXACT)
         for law, moved in runs.items():
             for metric in case.metrics:
                 expected, seen, ideal = metric.expected(moved.scene.envs), metric.seen(moved), metric.seen(exact[law])
@@ -60,7 +57,7 @@ def one(case: Case, steps: tuple[float, ...], device: Any) -> list[dict[str, Any
                     }
                 )
     rows = []
-    for law, lines in ((law, lines) for law, lines in found.items() if lines):
+    for law, lines in found.items():
         for metric in case.metrics:
             mine = [line for line in lines if line["metric"] == metric.name]
             row: dict[str, Any] = {"case": case.name, "law": law, "metric": metric.name, "unit": metric.unit}

@@ -233,14 +233,6 @@ def test_what_only_a_model_says_is_refused_to_other_engines(tmp_path):
         Session(peer, None, tmp_path).make(next(iter(peer.variants)), CASES["stick_slip"].scene(1e-3))
 
 
-def test_accuracy_without_the_midpoint_rule():
-    """It does not know joints: no row of it, and nothing else is missing."""
-    rows = accuracy.one(CASES["stop"], (1e-2, 1e-3), "cpu")
-    assert {row["law"] for row in rows} == {"default", "coulomb"}
-    assert len(rows) == 2 * len(CASES["stop"].metrics)
-    assert "| stop | fall [rad] | default |" in accuracy.markdown(rows)
-
-
 def test_energy_scale_does_not_hang_on_the_origin():
     """A cube of 2 kg and 0.2 m that rests: m g times its radius of gyration."""
     known, moved = known_glide(), glided((0.0, 0, 0))

@@ -88,13 +88,29 @@ def test_chain_converges_to_where_it_should_be():
 
 
 def test_fourbar_turns_as_it_should():
-    """Against its equation in the crank's angle: 5.6 rad/s h, of first order, after 2 s and a turn and an eighth."""
-    known, errors = crank_reference()[0], []
+    """Against its equation in the crank's angle, after 2 s and a turn and an eighth: 0.016 rad/s h, of first order.
+
+    With c of a mean velocity without the loop's impulses it is 5.6 rad/s h.
+    """
+    known = crank_reference()[0]
     for h in (2e-3, 1e-3, 5e-4):
-        angle = run(shipped("fourbar"), 2.0, h).q.numpy()[-1, 0, 0]
-        errors.append(abs(-angle - known))  # the joint's angle counts from z to x
-    assert errors[0] < 6.0 * 2e-3
-    assert np.array(errors[:-1]) / errors[1:] == pytest.approx([2.0, 2.0], abs=0.1)
+        angle = run(shipped("fourbar"), 2.0, h).q.numpy()[-1, 0, 0]  # it counts from z to x
+        assert abs(-angle - known) < 0.02 * h
+
+
+def test_midpoint_rule_with_joints():
+    """Of second order once steps resolve the motion; bars are what was measured and a half, Euler's rule misses by 3e-6 and 1.7e-4."""
+    for name, seconds, steps, bar in (("fourbar", 2.0, (2.5e-4, 1.25e-4), 8e-7), ("chain", 2.0, (5e-5, 2.5e-5), 7e-7)):
+        errors = []
+        for h in steps:
+            sim = simulator(shipped(name), dt=h, integrator="midpoint")
+            sim.step(round(seconds / h))
+            if name == "fourbar":
+                errors.append(abs(-sim.q.numpy()[0, 0] - crank_reference()[0]))
+            else:
+                errors.append(np.linalg.norm(sim.body_pose.numpy()[0, -1, [0, 2]] - chain_end(10, 0.1, 0.1, 100.0, seconds)))
+        assert errors[0] < bar
+        assert errors[0] / errors[1] == pytest.approx(4.0, abs=0.5)
 
 
 def test_fourbar_does_not_come_apart_in_100_s():
@@ -174,22 +190,25 @@ def bricard() -> wl.Model:
 def test_bricards_mechanism_moves():
     """Its loop holds six directions of which one is redundant in every pose, another one each time.
 
-    It opens by 2.5 (m/s^2) h^2 and no more, makes no energy, and loses 110 J/s h of its 29 J. Where its third rod is after 4 s
-    converges in first order: halving the step halves the way to the next.
+    It opens by 2.5 (m/s^2) h^2 and no more. Of its 29 J Euler's rule gives and takes 4 J/s h as it swings, the midpoint rule 5e-5 J. Where
+    its third rod is after 4 s is off by 0.8 m/s h, of first order; by the midpoint rule at 0.5 ms, which is held against, by 1e-6 m.
     """
-    model, opened, lost, ends = bricard(), [], [], []
-    for h in (4e-3, 2e-3, 1e-3):
+    model, opened, swung, ends = bricard(), [], [], []
+    sim = simulator(model, dt=5e-4, integrator="midpoint")
+    exact = sim.rollout(8000, record=("q", "v", "body_pose", "body_velocity"))
+    levels = energy(model, exact)
+    assert np.abs(levels - levels[0]).max() < 1e-4
+    for h in (2e-3, 1e-3, 5e-4):
         moved = run(model, 4.0, h)
         opened.append(openings(model, moved).max())
         levels = energy(model, moved)
-        assert levels.max() < levels[0] + 1e-6
-        lost.append(levels[0] - levels.min())
-        ends.append(moved.body_pose.numpy()[-1, 0, 2, :3])
-    assert opened[0] < 3.0 * 4e-3**2
-    assert np.array(opened[:-1]) / opened[1:] == pytest.approx([4.0, 4.0], abs=0.2)
-    assert lost[-1] < 0.12
-    assert np.array(lost[:-1]) / lost[1:] == pytest.approx([2.0, 2.0], abs=0.2)
-    assert np.linalg.norm(ends[1] - ends[0]) / np.linalg.norm(ends[2] - ends[1]) == pytest.approx(2.0, abs=0.1)
+        swung.append(np.abs(levels - levels[0]).max())
+        ends.append(np.linalg.norm((moved.body_pose.numpy()[-1] - exact.body_pose.numpy()[-1])[0, 2, :3]))
+    assert opened[0] < 3.0 * 2e-3**2
+    assert swung[0] < 5.0 * 2e-3
+    assert ends[0] < 1.0 * 2e-3
+    for errors, order in ((opened, 2), (swung, 1), (ends, 1)):
+        assert np.log2(np.array(errors[:-1]) / errors[1:]) == pytest.approx([order, order], abs=0.1)
 
 
 def ring() -> wl.Model:
@@ -420,7 +439,8 @@ def test_humanoid_stands():
 def test_humanoid_falls_and_lies_still(driven):
     """Pushed off at 1 m/s, also without its drives but for 0.2 N m s/rad: certified, at rest after 8 s, and its energy never rises.
 
-    1e-8 J of 550, springs of drives included. (Without any damping limbs swing as Euler's rule has it, which gives and takes 0.01 J.)
+    1e-8 J of 550, springs of drives included; without drives, by 3e-7 J once as the last limb lies down. (Without any damping limbs
+    swing as Euler's rule has it, which gives and takes 0.01 J.)
     """
     model = shipped("humanoid")
     start = model.v0.copy()
@@ -432,7 +452,7 @@ def test_humanoid_falls_and_lies_still(driven):
     moved = run(model, 8.0, 5e-3)
     levels = energy(model, moved)
     assert np.isfinite(levels).all()
-    assert (levels - np.minimum.accumulate(levels)).max() < 1e-8
+    assert (levels - np.minimum.accumulate(levels)).max() < (1e-8 if driven else 1e-6)
     assert np.abs(moved.v.numpy()[-200:]).max() < 1e-8
     assert moved.q.numpy()[-1, 0, 2] < 0.45
 

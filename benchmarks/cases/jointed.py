@@ -141,7 +141,7 @@ FOURBAR = Case(
     "a four-bar turns all round, its loop closed by rows, 2 s",
     partial(of_shipped, "fourbar", CRANK_TIME, False),
     (
-        Metric("crank", "rad", crank_angle, Lazy(crank_reference, 0), linear(8.0)),
+        Metric("crank", "rad", crank_angle, Lazy(crank_reference, 0), linear(1.0)),
         Metric("opening", "m", opening, 0.0, lambda h: 30.0 * h * h),
     ),
     "Lagrange's equation of its one degree of freedom, DOP853 at 1e-9",
