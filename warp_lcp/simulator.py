@@ -139,10 +139,10 @@ class Simulator:
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
         precision: 'float64' or 'float32', of state and solution.
         integrator: 'euler', q+ = q + h Gamma v+ (eq. 23), or 'midpoint', q+ = q + h Gamma (v + v+) / 2 but for bodies that
-            this would drive into others: second order away from impacts.
+            this would drive into others, with joints half before the forces of the step and half after: second order away from impacts.
         device: Warp device; None = Warp's default.
-        project_loops: bring joints that close loops back together after each step. Without it they are apart by what a step of Euler's
-            rule opens them, of second order in dt, which does not grow.
+        project_loops: bring joints that close loops back together after each step (not with 'midpoint'). Without it they are apart by
+            what a step opens them, of second order in dt, which does not grow.
         strict: raise after a step in which an environment's status is not OK (reads the status back every time);
             RESTITUTION_REDUCED alone does not count.
 
