@@ -2,10 +2,13 @@
 """Masses of UsdPhysics bodies: what is authored, what follows from colliders, and which comes first."""
 
 import math
+import sys
 
 import numpy as np
 import pytest
 from test_usd import BOUND, COLLIDER, MASS, body, bound_cube, cube, load, material, prim, read, refused, xform
+
+import warp_lcp as wl
 
 DENSE = cube(content="float physics:density = 250;", apis=(COLLIDER, MASS))
 HEAVY = cube(content="float physics:mass = 7;", apis=(COLLIDER, MASS))
@@ -119,3 +122,44 @@ def test_mass_of_cylinders_cones_and_meshes():
     reading = read(body(inner=prim("Mesh", "C", (COLLIDER,), flat)))
     assert reading.mass is None
     assert [i.path for i in reading.report.unsupported] == ["/B/C"]
+
+
+def angle_iron() -> str:
+    """An L of two arms, 2 m and 1 m wide, as a Mesh that is to be decomposed."""
+    profile = np.array([[0, 0], [2, 0], [2, 1], [1, 1], [1, 2], [0, 2]])
+    points = np.vstack([np.c_[profile[:, :1], np.full(6, y), profile[:, 1:]] for y in (0, 1)])
+    faces = [(5, 4, 3, 2, 1, 0), (6, 7, 8, 9, 10, 11), *((i, (i + 1) % 6, (i + 1) % 6 + 6, i + 6) for i in range(6))]
+    # An L is no polygon that may be cut into a fan from any corner: from the inner one it may.
+    faces[0], faces[1] = (3, 2, 1, 0, 5, 4), (9, 10, 11, 6, 7, 8)
+    text = ", ".join(str(tuple(p)) for p in points.tolist())
+    content = f"point3f[] points = [{text}]; int[] faceVertexCounts = [{', '.join(str(len(f)) for f in faces)}];"
+    content += f"int[] faceVertexIndices = [{', '.join(str(i) for f in faces for i in f)}];"
+    return prim(
+        "Mesh", "L", (COLLIDER, "PhysicsMeshCollisionAPI"), content + 'uniform token physics:approximation = "convexDecomposition";'
+    )
+
+
+def test_decomposition_of_what_moves_is_hollow_where_the_mesh_is():
+    """An L that stands on the ground holds a ball in its corner, where its convex hull would keep it out.
+
+    CoACD moves corners by 1e-4 of the size, so mass and heights are within a thousandth.
+    """
+    ball = prim("Sphere", "S", (COLLIDER,), "double radius = 0.3;")
+    model = load(
+        body("B", inner=angle_iron()), body("Ball", xform(translate="(1.35, 0.5, 1.4)"), inner=ball), prim("Plane", "G", (COLLIDER,))
+    )
+    assert model.mass[0] == pytest.approx(3000.0, rel=1e-3)
+    assert model.com[0] == pytest.approx([5 / 6, 0.5, 5 / 6], abs=2e-3)
+    assert [name for name in model.shape_names if "/B/" in name] == ["/B/L[0]", "/B/L[1]"]
+    (note,) = [note for note in model.report.notes if "CoACD" in note]
+    assert note.startswith("/B/L: 2 convex pieces stand for it")
+    sim = wl.Simulator(model, dt=2e-3, device="cpu")
+    sim.step(500)
+    assert not sim.status.numpy().any()
+    assert sim.q.numpy()[0, 9] == pytest.approx(1.3, abs=2e-3)
+
+
+def test_decomposition_without_coacd(monkeypatch):
+    monkeypatch.setitem(sys.modules, "coacd", None)
+    with pytest.raises(wl.MissingExtra, match=r"decomposing meshes needs the extra 'mesh'"):
+        load(body(inner=angle_iron()))

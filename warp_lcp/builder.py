@@ -59,27 +59,28 @@ class _Shape:
     surface_velocity: np.ndarray
     hull: Hull | Mesh | None
 
-    def solid(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """Volume, centre of mass [3] and inertia [3, 3] per unit mass about it, in the shape's frame."""
-        centre, (r, h) = np.zeros(3), self.size[:2]
-        if isinstance(self.hull, Hull):
-            return hulls.solid(self.hull)
-        if self.type is ShapeType.BOX:
-            s = self.size**2
-            return 8.0 * float(np.prod(self.size)), centre, np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) / 3.0
-        if self.type is ShapeType.SPHERE:
-            return 4.0 / 3.0 * np.pi * r**3, centre, np.eye(3) * 0.4 * r**2
-        if self.type is ShapeType.ELLIPSOID:
-            s = self.size**2
-            return 4.0 / 3.0 * np.pi * float(np.prod(self.size)), centre, np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) / 5.0
-        if self.type is ShapeType.CAPSULE:
-            volume, along, across = capsule_solid(r, h)
-        elif self.type is ShapeType.CYLINDER:
-            volume, along, across = 2.0 * np.pi * r**2 * h, r**2 / 2.0, r**2 / 4.0 + h**2 / 3.0
-        else:
-            volume, along, across = 2.0 / 3.0 * np.pi * r**2 * h, 0.3 * r**2, 0.15 * (r**2 + h**2)
-            centre = np.array([0.0, 0.0, -0.5 * h])
-        return volume, centre, np.diag([across, across, along])
+
+def solid(kind: ShapeType, size: np.ndarray, hull: Hull | Mesh | None = None) -> tuple[float, np.ndarray, np.ndarray]:
+    """Volume, centre of mass [3] and inertia [3, 3] per unit mass about it, in the frame of a shape of this type and size [3]."""
+    centre, (r, h) = np.zeros(3), size[:2]
+    if isinstance(hull, Hull):
+        return hulls.solid(hull)
+    if kind is ShapeType.BOX:
+        s = size**2
+        return 8.0 * float(np.prod(size)), centre, np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) / 3.0
+    if kind is ShapeType.SPHERE:
+        return 4.0 / 3.0 * np.pi * r**3, centre, np.eye(3) * 0.4 * r**2
+    if kind is ShapeType.ELLIPSOID:
+        s = size**2
+        return 4.0 / 3.0 * np.pi * float(np.prod(size)), centre, np.diag([s[1] + s[2], s[0] + s[2], s[0] + s[1]]) / 5.0
+    if kind is ShapeType.CAPSULE:
+        volume, along, across = capsule_solid(r, h)
+    elif kind is ShapeType.CYLINDER:
+        volume, along, across = 2.0 * np.pi * r**2 * h, r**2 / 2.0, r**2 / 4.0 + h**2 / 3.0
+    else:
+        volume, along, across = 2.0 / 3.0 * np.pi * r**2 * h, 0.3 * r**2, 0.15 * (r**2 + h**2)
+        centre = np.array([0.0, 0.0, -0.5 * h])
+    return volume, centre, np.diag([across, across, along])
 
 
 def capsule_solid(r: float, h: float) -> tuple[float, float, float]:
@@ -340,6 +341,10 @@ class ModelBuilder:
             MissingExtra: no scipy is installed (the extra 'mesh').
         """
         hull, _ = hulls.convex_hull(options.get("name") or f"shape{len(self._shapes)}", points)
+        return self.place_hull(body, hull, pose=pose, **options)
+
+    def place_hull(self, body: int, hull: Hull, *, pose: Sequence[float] = IDENTITY, **options) -> int:
+        """Add a hull that is known already; as :meth:`add_hull`."""
         middle, size = _bounds(hull.points)
         where = joints.compose(_pose("hull", pose), np.r_[middle, IDENTITY[3:]]).tolist()
         return self._add_shape(ShapeType.HULL, body, where, size, hull=Hull(hull.points - middle, hull.faces), **options)
@@ -595,7 +600,7 @@ class ModelBuilder:
         parts = []
         for s in self._shapes:
             if s.body == index and s.type not in (ShapeType.PLANE, ShapeType.MESH):
-                (volume, centre, inertia), rot = s.solid(), rotation_matrix(s.pose[3:])
+                (volume, centre, inertia), rot = solid(s.type, s.size, s.hull), rotation_matrix(s.pose[3:])
                 m = s.density * volume
                 parts.append((m, s.pose[:3] + rot @ centre, m * rot @ inertia @ rot.T))
         if parts:

@@ -60,6 +60,33 @@ def convex_hull(name: str, points: Any) -> tuple[Hull, float]:
     return Hull(points[hull.vertices], tuple(_faces(points, hull, place, size))), short
 
 
+def decomposition(name: str, points: np.ndarray, triangles: np.ndarray) -> tuple[list[Hull], float]:
+    """Convex pieces that stand for a mesh, by CoACD (Wei et al. 2022), and how far its corners are beyond all of them at most.
+
+    Pieces leave out at most a twentieth of the mesh's size of what is hollow (its ``threshold``), and are the same every time.
+
+    Raises:
+        ModelError: for a mesh that is none, or a piece without volume.
+        MissingExtra: no coacd or no scipy is installed.
+    """
+    try:
+        import coacd
+    except ImportError as error:
+        raise MissingExtra("decomposing meshes", "mesh", error) from error
+    whole = mesh(name, points, triangles)
+    coacd.set_log_level("error")
+    pieces = coacd.run_coacd(coacd.Mesh(whole.points, whole.triangles), seed=0)
+    found = [convex_hull(f"{name}[{i}]", corners)[0] for i, (corners, _) in enumerate(pieces)]
+    beyond = np.min([_beyond(hull, whole.points[np.unique(whole.triangles)]) for hull in found], axis=0)
+    return found, float(max(beyond.max(), 0.0))
+
+
+def _beyond(hull: Hull, points: np.ndarray) -> np.ndarray:
+    """[N] how far points [N, 3] are beyond the planes of a hull, negative inside."""
+    planes = [(face_normal(hull.points, face), hull.points[face[0]]) for face in hull.faces]
+    return np.max([(points - on) @ n for n, on in planes], axis=0)
+
+
 def _faces(points: np.ndarray, hull: Any, place: np.ndarray, size: float) -> list[tuple[int, ...]]:
     """Triangles in one plane are one face: its corners counterclockwise from outside, in the hull's own numbers."""
     left, faces = np.ones(len(hull.simplices), dtype=bool), []

@@ -40,14 +40,12 @@ import numpy as np
 
 from .builder import ModelBuilder
 from .errors import MissingExtra, ModelError, SceneError
-from .model import Combine, Ignored, JointType, Material, Model, Report, ShapeType
+from .model import Combine, Ignored, JointType, Material, Model, Report
 from .usd_attributes import COMBINE_ATTRIBUTES, CONTACT_ATTRIBUTES, SELF_COLLISION, SURFACE_VELOCITY, decimals, unread, written
 from .usd_joints import JointReader, some
 from .usd_mass import MassReader, Unusable
-from .usd_shapes import Solid, mesh_solid, round_solid
+from .usd_shapes import COLLIDERS, UNIFORM, Solid, solids
 
-_UNIFORM = 1e-4  # relative: scales closer than this are equal, axes closer than this are perpendicular
-_COLLIDERS = ("PlaneShape", "CubeShape", "SphereShape", "CapsuleShape", "CylinderShape", "ConeShape", "MeshShape")
 _SHAPES = "Plane, Cube, Sphere, Capsule, Cylinder, Cone or Mesh"
 _LISTED = 100  # unsupported prims that an error lists by path; the report always has all
 
@@ -232,7 +230,7 @@ class _Frame:
     @property
     def sheared(self) -> bool:
         axes = self.linear / np.maximum(self.scale, 1e-300)
-        return bool(np.abs(np.triu(axes.T @ axes, 1)).max() > _UNIFORM)
+        return bool(np.abs(np.triu(axes.T @ axes, 1)).max() > UNIFORM)
 
 
 @dataclass
@@ -274,7 +272,7 @@ class _Reader:
         self.masses: list[float | None] = []
         self.massless: list[Any] = []
         self.unbound: list[str] = []
-        self.solids: dict[Any, Solid] = {}
+        self.solids: dict[Any, tuple[Solid, ...]] = {}
         self.all_joints: set[Any] = set()
 
     # -- the whole --------------------------------------------------------------------------------------------------
@@ -433,27 +431,6 @@ class _Reader:
 
     # -- shapes -----------------------------------------------------------------------------------------------------
 
-    def _half_extents(self, prim: Any, frame: _Frame) -> np.ndarray:
-        return 0.5 * float(self.px.UsdGeom.Cube(prim).GetSizeAttr().Get()) * frame.scale
-
-    def _sphere(self, prim: Any, frame: _Frame) -> tuple[np.ndarray, np.ndarray]:
-        """Semi-axes [3] of a Sphere in stage units, all alike where it is scaled evenly, and the rotation of their axes.
-
-        A slanted ball is an ellipsoid as well; its axes are then the principal ones of what turns the ball into it.
-        """
-        radius, stretch = float(self.px.UsdGeom.Sphere(prim).GetRadiusAttr().Get()), frame.stretch
-        if stretch[0] - stretch[2] <= _UNIFORM * stretch[0]:
-            return np.full(3, radius * frame.scale.max()), frame.rotation
-        if not frame.sheared:
-            return radius * frame.scale, frame.rotation
-        axes, _, _ = np.linalg.svd(frame.linear)
-        return radius * stretch, axes * [1.0, 1.0, np.linalg.det(axes)]
-
-    def _capsule(self, prim: Any, frame: _Frame) -> tuple[float, float]:
-        """Radius and half the length of the straight part."""
-        api, scale = self.px.UsdGeom.Capsule(prim), frame.scale.max()
-        return float(api.GetRadiusAttr().Get()) * scale, 0.5 * float(api.GetHeightAttr().Get()) * scale
-
     def _shape(self, path: Any, desc: Any) -> None:
         prim, frame, owner = self.stage.GetPrimAtPath(path), self._frame(path), desc.rigidBody
         problem = self._shape_problem(prim, desc, frame)
@@ -463,96 +440,47 @@ class _Reader:
         if owner and owner not in self.bodies:
             return  # refused with its body
         body = self.bodies[owner] if owner else None
-        index, kind = -1 if body is None else body.index, str(desc.type).rpartition(".")[2]
-        if kind == "PlaneShape":
-            rotation = self._plane_rotation(prim, frame)
-        elif kind == "SphereShape":
-            semi_axes, rotation = self._sphere(prim, frame)
-        elif kind == "CapsuleShape":  # the prim's axis becomes the shape's z
-            rotation = np.roll(frame.rotation, 2 - "XYZ".index(str(self.px.UsdGeom.Capsule(prim).GetAxisAttr().Get())), axis=1)
-        else:
-            rotation = frame.rotation
-        solid = None
-        if kind in ("CylinderShape", "ConeShape", "MeshShape"):
-            try:
-                solid = self._solid_of(prim, desc, frame)
-            except ModelError as error:
-                self.unsupported.append(Ignored(str(path), f"{prim.GetTypeName()} collider", str(error).removeprefix(f"{path}: ")))
-                return
-            self.notes.extend(solid.notes)
-            if solid.kind in (ShapeType.CYLINDER, ShapeType.CONE):
-                rotation = np.roll(frame.rotation, 2 - solid.axis, axis=1)
-                if frame.sign < 0.0:  # a mirrored cone has its tip on the other side
-                    rotation = rotation * [1.0, -1.0, -1.0]
-            elif solid.centre is not None:
-                frame = replace(frame, position=frame.position + frame.rotation @ solid.centre)
-        options: dict[str, Any] = {
-            "pose": self._pose(frame, None if body is None else body.frame, rotation),
-            "name": str(path),
-            "material": self._material(prim),
-            "surface_velocity": self._surface_velocity(prim, frame, rotation),
-        }
         try:
-            if solid is not None:
-                shape = self._add_solid(index, solid, options)
-            elif kind == "PlaneShape":
-                shape = self.builder.add_plane(index, **options)
-            elif kind == "SphereShape" and semi_axes.min() == semi_axes.max():
-                shape = self.builder.add_sphere(index, self.length * semi_axes[0], **options)
-            elif kind == "SphereShape":
-                shape = self.builder.add_ellipsoid(index, (self.length * semi_axes).tolist(), **options)
-            elif kind == "CapsuleShape":
-                radius, half_length = self._capsule(prim, frame)
-                shape = self.builder.add_capsule(index, self.length * radius, self.length * half_length, **options)
-            else:
-                shape = self.builder.add_box(index, (self.length * self._half_extents(prim, frame)).tolist(), **options)
+            found = self.solids_of(prim, desc, frame)
+            for i, solid in enumerate(found):
+                rotation = frame.rotation @ solid.turn
+                place = replace(frame, position=frame.position + frame.rotation @ solid.centre)
+                options = {
+                    "pose": self._pose(place, None if body is None else body.frame, rotation),
+                    "name": f"{path}[{i}]" if len(found) > 1 else str(path),
+                    "material": self._material(prim),
+                    "surface_velocity": self._surface_velocity(prim, frame, rotation),
+                }
+                self.shapes.append(
+                    _Shape(path, desc, owner, solid.add(self.builder, -1 if body is None else body.index, self.length, options))
+                )
+                self.notes.extend(solid.notes)
         except ModelError as error:
             self.unsupported.append(Ignored(str(path), f"{prim.GetTypeName()} collider", str(error).removeprefix(f"{path}: ")))
-        else:
-            self.shapes.append(_Shape(path, desc, owner, shape))
 
-    def _solid_of(self, prim: Any, desc: Any, frame: _Frame) -> Solid:
-        """Of a cylinder, cone or mesh, found once."""
-        path, kind = prim.GetPath(), str(desc.type).rpartition(".")[2]
+    def solids_of(self, prim: Any, desc: Any, frame: _Frame) -> tuple[Solid, ...]:
+        """Of a collider that is supported, found once."""
+        path = prim.GetPath()
         if path not in self.solids:
-            if kind == "MeshShape":
-                owner = self.body_descs.get(desc.rigidBody) if desc.rigidBody else None
-                self.solids[path] = mesh_solid(
-                    self.px, prim, frame.rotation.T @ frame.linear, owner is not None and not owner.kinematicBody
-                )
-            else:
-                self.solids[path] = round_solid(self.px, prim, kind, frame.scale)
+            owner = self.body_descs.get(desc.rigidBody) if desc.rigidBody else None
+            self.solids[path] = solids(self.px, prim, desc, frame, owner is not None and not owner.kinematicBody)
         return self.solids[path]
-
-    def _add_solid(self, body: int, solid: Solid, options: dict[str, Any]) -> int:
-        size = [self.length * x for x in solid.size]
-        if solid.kind is ShapeType.CYLINDER:
-            return self.builder.add_cylinder(body, size[0], size[1], **options)
-        if solid.kind is ShapeType.CONE:
-            return self.builder.add_cone(body, size[0], size[1], **options)
-        if solid.kind is ShapeType.BOX:
-            return self.builder.add_box(body, size, **options)
-        if solid.kind is ShapeType.SPHERE:
-            return self.builder.add_sphere(body, size[0], **options)
-        if solid.hull is not None:
-            return self.builder.add_hull(body, self.length * solid.hull.points, **options)
-        return self.builder.add_mesh(body, self.length * np.asarray(solid.points), solid.triangles, **options)
 
     def _shape_problem(self, prim: Any, desc: Any, frame: _Frame) -> tuple[str, str] | None:
         """(what, why) where a collider cannot be simulated."""
         name, kind = f"{prim.GetTypeName()} collider", str(desc.type).rpartition(".")[2]
-        if kind not in _COLLIDERS:
+        if kind not in COLLIDERS:
             return name, f"this shape is not supported; use {_SHAPES}, or set physics:collisionEnabled = false"
         owner = self.body_descs.get(desc.rigidBody) if desc.rigidBody else None
         if kind == "PlaneShape" and owner is not None and not owner.kinematicBody:
             return name, "a plane is infinite and cannot move freely; make it static or its body kinematic"
         stretch = frame.stretch
-        if kind == "CapsuleShape" and stretch[0] - stretch[2] > _UNIFORM * stretch[0]:
+        if kind == "CapsuleShape" and stretch[0] - stretch[2] > UNIFORM * stretch[0]:
             return "Capsule collider with ends scaled to ellipsoids", "this shape is not supported yet; scale all axes alike"
         if kind in ("CylinderShape", "ConeShape"):
             axis = "XYZ".index(str(desc.axis).rpartition(".")[2])
             one, other = frame.scale[(axis + 1) % 3], frame.scale[(axis + 2) % 3]
-            if abs(one - other) > _UNIFORM * max(one, other):
+            if abs(one - other) > UNIFORM * max(one, other):
                 return (
                     f"{name} scaled to an ellipse",
                     "this shape is not supported; scale both axes across it alike, or use a Mesh",
@@ -561,14 +489,6 @@ class _Reader:
             what = name.removesuffix(" collider")
             return f"sheared {name}", f"a rotation under a non-uniform scale slants it; put the scale on the {what} itself"
         return None
-
-    def _plane_rotation(self, prim: Any, frame: _Frame) -> np.ndarray:
-        """Frame of a plane: z = the side to which the prim's axis points, x and y in the plane."""
-        k = "XYZ".index(str(self.px.UsdGeom.Plane(prim).GetAxisAttr().Get()))
-        a, b = frame.linear[:, (k + 1) % 3], frame.linear[:, (k + 2) % 3]
-        normal = frame.sign * np.cross(a, b)
-        normal, a = normal / np.linalg.norm(normal), a / np.linalg.norm(a)
-        return np.stack([a, np.cross(normal, a), normal], axis=1)
 
     def _surface_velocity(self, prim: Any, frame: _Frame, rotation: np.ndarray) -> np.ndarray:
         """[3] m/s in the shape's frame."""

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from . import hulls
-from .builder import capsule_solid, rotation_matrix
+from .builder import compose_mass, rotation_matrix
 from .errors import ModelError
-from .model import ShapeType
 from .usd_attributes import decimals, written
-from .usd_shapes import round_solid
+from .usd_shapes import COLLIDERS
 
 
 class Unusable(Exception):
@@ -109,8 +107,8 @@ class MassReader:
         solid = self._solid(prim, self.reader.colliders.get(prim.GetPath()), frame)
         if solid is None:
             unknown.append(prim.GetPath())
-            solid = (1.0, np.eye(3), np.zeros(3))
-        volume, inertia, centre = solid
+            solid = (1.0, np.zeros(3), np.eye(3))
+        volume, centre, inertia = solid
         info.volume = float(volume)
         info.inertia = Gf.Matrix3f(*(volume * inertia).ravel().tolist())
         info.centerOfMass = Gf.Vec3f(*centre.tolist())
@@ -120,45 +118,16 @@ class MassReader:
         return info
 
     def _solid(self, prim: Any, desc: Any, frame: Any) -> tuple[float, np.ndarray, np.ndarray] | None:
-        """(volume, inertia [3, 3] per unit mass about the centre, centre) in the collider's frame; None = unknown."""
-        kind = "" if desc is None else str(desc.type).rpartition(".")[2]
-        if kind == "CubeShape":
-            half = self.reader._half_extents(prim, frame)
-            return 8.0 * float(np.prod(half)), np.diag(half @ half - half**2) / 3.0, np.zeros(3)
-        if kind == "SphereShape":
-            size, rotation = self.reader._sphere(prim, frame)
-            if size.min() == size.max():
-                return 4.0 / 3.0 * math.pi * size[0] ** 3, 0.4 * size[0] ** 2 * np.eye(3), np.zeros(3)
-            turn = frame.rotation.T @ rotation
-            inertia = turn @ np.diag(0.2 * (size @ size - size**2)) @ turn.T
-            return 4.0 / 3.0 * math.pi * float(np.prod(size)), inertia, np.zeros(3)
-        if kind == "MeshShape":
-            return self._mesh_mass(prim, desc, frame)
-        if kind not in ("CapsuleShape", "CylinderShape", "ConeShape"):
+        """(volume, centre, inertia [3, 3] per unit mass about it) in the collider's frame; None = unknown."""
+        if desc is None or str(desc.type).rpartition(".")[2] not in COLLIDERS:
             return None
-        centre, axis = np.zeros(3), "XYZ".index(str(desc.axis).rpartition(".")[2])
-        # h: half the height, of a capsule that of its straight part.
-        r, h = self.reader._capsule(prim, frame) if kind == "CapsuleShape" else round_solid(self.reader.px, prim, kind, frame.scale).size
-        if kind == "CapsuleShape":
-            volume, along, across = capsule_solid(r, h)
-        elif kind == "CylinderShape":
-            volume, along, across = 2.0 * math.pi * r**2 * h, r**2 / 2, r**2 / 4 + h**2 / 3
-        else:
-            volume, along, across = 2.0 / 3.0 * math.pi * r**2 * h, 0.3 * r**2, 0.15 * r**2 + 0.15 * h**2
-            centre[axis] = -0.5 * h * frame.sign
-        return volume, np.diag(np.where(np.arange(3) == axis, along, across)), centre
-
-    def _mesh_mass(self, prim: Any, desc: Any, frame: Any) -> tuple[float, np.ndarray, np.ndarray] | None:
         try:
-            solid = self.reader._solid_of(prim, desc, frame)
+            parts = [solid.volume() for solid in self.reader.solids_of(prim, desc, frame)]
         except ModelError:
             return None  # refused as a shape
-        if solid.hull is not None:
-            volume, centre, inertia = hulls.solid(solid.hull)
-            return volume, inertia, centre
-        if solid.kind is ShapeType.BOX:
-            half = np.array(solid.size)
-            return 8.0 * float(np.prod(half)), np.diag(half @ half - half**2) / 3.0, np.asarray(solid.centre)
-        if solid.kind is ShapeType.SPHERE:
-            return 4.0 / 3.0 * math.pi * solid.size[0] ** 3, 0.4 * solid.size[0] ** 2 * np.eye(3), np.asarray(solid.centre)
-        return None
+        if any(part is None for part in parts):
+            return None
+        if len(parts) == 1:
+            return parts[0]
+        volume, centre, inertia = compose_mass([(v, c, v * i) for v, c, i in parts])  # type: ignore[misc]
+        return volume, centre, inertia / volume
