@@ -209,8 +209,10 @@ def no_more_than_once(rows: list[dict[str, Any]], *names: str) -> None:
 
 
 def run_stability(asked: argparse.Namespace) -> None:
-    """Measured and kept, unless data are given; told and drawn. Parts that are joined are kept as one."""
+    """Measured and kept after every case, unless data are given; told and drawn. Parts that are joined are kept as one."""
     device = wp.get_device(asked.device)
+    rows: list[dict[str, Any]] = []
+    crowds: list[dict[str, Any]] = []
     if asked.data:
         data, parts = joined(asked.data, "stability", "rows", "crowds")
         no_more_than_once(data["rows"], "case", "variant", "h")
@@ -219,8 +221,11 @@ def run_stability(asked: argparse.Namespace) -> None:
         crowds = sorted(data["crowds"], key=lambda row: order.index(row["scene"]))
     else:
         variants = asked.variants or stability.chosen("some" if asked.quick else "all")
-        rows, parts = stability.measure(device, asked.cases, variants, asked.quick), {}
-        crowds = stability.crowd(device, asked.cases, asked.envs or (stability.QUICK_CROWD if asked.quick else stability.CROWD))
+        envs, parts = asked.envs or (stability.QUICK_CROWD if asked.quick else stability.CROWD), {}
+        for rows in stability.measure(device, asked.cases, variants, asked.quick):
+            report.write(asked.out or report.PARTIAL, asked.what, device, {"rows": rows, "crowds": crowds})
+        for crowds in stability.crowd(device, asked.cases, envs):
+            report.write(asked.out or report.PARTIAL, asked.what, device, {"rows": rows, "crowds": crowds})
     complete = stability.complete(rows, crowds)
     print(stability.markdown(rows, crowds))
     if not asked.data or len(asked.data) > 1:

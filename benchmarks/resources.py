@@ -76,9 +76,8 @@ def kernels(precision: str) -> dict[str, wp.Kernel]:
     for model in scenes():
         bounces = "joints" if model.articulated else "restitution" if model.bounces else ""
         options = [{"method": m} for m in METHODS if precision == "float64" or m != "velocity_pivoting"]
+        options.append({"method": "pgs", "integrator": "midpoint"})
         laws = [{"formulation": law} for law in ("coulomb", "hybrid")]
-        if not model.articulated:
-            options.append({"method": "pgs", "integrator": "midpoint"})
         for option in (*options, *laws):
             for kernel in wl.Simulator(model, precision=precision, device="cpu", **option).kernels:
                 if kernel not in found.values():

@@ -9,6 +9,7 @@ stated with the cases; none depends on the method.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -162,10 +163,10 @@ def one(case: Case, variant: Variant, h: float, device: Any, exact: Motion | Non
     }
 
 
-def measure(device: Any, names: list[str], variants: list[Variant], quick: bool) -> list[dict[str, Any]]:
-    """Every case under every variant at every step."""
+def measure(device: Any, names: list[str], variants: list[Variant], quick: bool) -> Iterator[list[dict[str, Any]]]:
+    """Every case under every variant at every step; yields all rows that there are whenever a case is done."""
     steps = QUICK_STEPS if quick else STEPS
-    rows = []
+    rows: list[dict[str, Any]] = []
     progress = tqdm(total=len(names) * len(variants) * len(steps), desc="stability", disable=None)
     for name in names:
         case = CASES[name]
@@ -177,13 +178,16 @@ def measure(device: Any, names: list[str], variants: list[Variant], quick: bool)
                     exact[integrator] = case.simulate(h, device=device, formulation="coulomb", integrator=integrator)
                 rows.append(one(case, variant, h, device, exact.get(integrator), QUICK_LIMIT_S if quick else LIMIT_S))
                 progress.update()
+        yield rows
     progress.close()
-    return rows
 
 
-def crowd(device: Any, names: list[str], envs: int, h: float = 5e-3) -> list[dict[str, Any]]:
-    """Many randomised copies of every case with the default: counts over all of them, the worst environment, never a mean."""
-    rows = []
+def crowd(device: Any, names: list[str], envs: int, h: float = 5e-3) -> Iterator[list[dict[str, Any]]]:
+    """Many randomised copies of every case with the default: counts over all of them, the worst environment, never a mean.
+
+    Yields likewise.
+    """
+    rows: list[dict[str, Any]] = []
     for name in names:
         scene = CASES[name].scene(h, envs)
         sim = scene.simulator(device=device)
@@ -191,7 +195,7 @@ def crowd(device: Any, names: list[str], envs: int, h: float = 5e-3) -> list[dic
         rows.append(
             robust.count(name, sim, scene.steps, lambda s, scene=scene: robust.randomise(s, wrench=scene.wrench)) | {"seconds": seconds}
         )
-    return rows
+        yield rows
 
 
 # ------------------------------------------------------------------------------------------------------------------- reports
