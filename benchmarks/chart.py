@@ -10,6 +10,7 @@ engines in turns; the energy by which steps of that part miss the laws (energy_e
 from __future__ import annotations
 
 import math
+import re
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -372,6 +373,11 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     out = [row for row in rows if not counts(row)]
     if out:
         lines += ["", "Not in the chart:", ""]
+        alike: dict[tuple[str, str, str], dict[str, list[str]]] = {}  # reasons that differ in numbers alone are one
         for row in out:
-            lines.append(f"- {row['case']}: {row['engine']} {row['setting']}, {row['knob']}: {against(row)}")
+            why = re.sub(r"(?<![\w.])\d[\d.]*", "...", against(row))
+            alike.setdefault((row["case"], row["engine"], why), {}).setdefault(row["setting"], []).append(row["knob"])
+        for (name, engine, why), settings in alike.items():
+            which = "; ".join(f"{setting}: {', '.join(knobs)}" for setting, knobs in settings.items())
+            lines.append(f"- {name}, {engine}: {why} ({which})")
     return "\n".join(lines)

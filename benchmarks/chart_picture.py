@@ -100,9 +100,9 @@ def draw(rows: list[dict[str, Any]], path: Path, key: str = "error") -> list[Pat
     plt = pyplot(**STYLE)
     good = [row for row in rows if counts(row) and row.get(key) is not None]
     cases = [name for name in dict.fromkeys(row["case"] for row in rows) if key == "error" or name in {row["case"] for row in good}]
-    columns = 3
+    columns = 3 if len(cases) < 9 else 4
     lines = -(-(len(cases) + 1) // columns)
-    figure, axes = plt.subplots(lines, columns, figsize=(13.0, 4.2 * lines + 1.2), squeeze=False)
+    figure, axes = plt.subplots(lines, columns, figsize=(4.3 * columns, 4.2 * lines + 1.2), squeeze=False)
     titles: dict[str, str] = {}
     for axis, name in zip(axes.flat, cases, strict=False):
         panel(axis, [row for row in good if row["case"] == name], key, ROUND_OFF if key == "error" else LEAST_ENERGY, titles)

@@ -80,7 +80,8 @@ def problems(scene: Scene | Robot, done: Task) -> list[str]:
     elif not done.same:
         found.append("timed and recorded runs differ")
     if done.info["overflow"]:
-        found.append("contacts or rows overflowed")
+        stopped = done.info.get("stopped_envs")
+        found.append("it stopped by itself: bad numbers, or no room" if stopped else "contacts or rows overflowed")
     return found
 
 
