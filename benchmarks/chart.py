@@ -373,11 +373,14 @@ def markdown(rows: list[dict[str, Any]]) -> str:
     out = [row for row in rows if not counts(row)]
     if out:
         lines += ["", "Not in the chart:", ""]
-        alike: dict[tuple[str, str, str], dict[str, list[str]]] = {}  # reasons that differ in numbers alone are one
+        alike: dict[tuple[str, str, str], list[dict[str, Any]]] = {}  # reasons that differ in numbers alone are told once
         for row in out:
-            why = re.sub(r"(?<![\w.])\d[\d.]*", "...", against(row))
-            alike.setdefault((row["case"], row["engine"], why), {}).setdefault(row["setting"], []).append(row["knob"])
-        for (name, engine, why), settings in alike.items():
-            which = "; ".join(f"{setting}: {', '.join(knobs)}" for setting, knobs in settings.items())
-            lines.append(f"- {name}, {engine}: {why} ({which})")
+            alike.setdefault((row["case"], row["engine"], re.sub(r"(?<![\w.])\d[\w.+-]*", "...", against(row))), []).append(row)
+        for (name, engine, blanked), found in alike.items():
+            why = against(found[0]) if len({against(row) for row in found}) == 1 else blanked
+            knobs: dict[str, list[str]] = {}
+            for row in found:
+                knobs.setdefault(row["setting"], []).append(row["knob"])
+            where = "; ".join(f"{setting}: {', '.join(at)}" for setting, at in knobs.items())
+            lines.append(f"- {name}, {engine}: {why} ({where})")
     return "\n".join(lines)
