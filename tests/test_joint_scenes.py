@@ -84,6 +84,24 @@ def test_chain_converges_to_where_it_should_be():
     assert np.array(errors[:-1]) / errors[1:] == pytest.approx([2.0, 2.0], abs=0.1)
 
 
+def test_midpoint_rule_with_joints_is_eulers_between_half_way_poses():
+    """From rest a ball beside a link has the same velocities by both, impacts with e = 0.5 included; its poses are means of two of Euler's."""
+    builder, material = wl.ModelBuilder(), wl.Material(0.0, 0.0, restitution=0.5)
+    builder.add_plane(material=material)
+    ball = builder.add_body(pose=(0, 0, 0.6, 0, 0, 0, 1), mass=2.0)
+    builder.add_sphere(ball, 0.1, material=material)
+    link = builder.add_body(pose=(3, 0, 2, 0, 0, 0, 1), mass=1.0, inertia=0.01 * np.eye(3))
+    builder.add_joint(JointType.REVOLUTE, -1, link, parent_frame=(3, 0, 2.5, 0, 0, 0, 1), child_frame=(0, 0, 0.5, 0, 0, 0, 1))
+    model, q, v = builder.finalize(), {}, {}
+    for rule in ("euler", "midpoint"):
+        moved = simulator(model, dt=2e-3, integrator=rule).rollout(500, record=("q", "v"))
+        q[rule], v[rule] = moved.q.numpy()[:, 0, 2], moved.v.numpy()[:, 0, 2]
+    assert np.count_nonzero(np.diff(np.sign(v["euler"])) > 0) >= 4
+    assert v["midpoint"] == pytest.approx(v["euler"], abs=1e-9)
+    halves = 0.5 * (np.r_[0.6, q["euler"][:-1]] + q["euler"])
+    assert q["midpoint"] == pytest.approx(halves, abs=1e-9)
+
+
 # ------------------------------------------------------------------------------------------------------------------- loops
 
 

@@ -187,6 +187,7 @@ class Simulator:
         self.model, self.num_envs, self.dt = model, whole_number("num_envs", num_envs, 1), positive_number("dt", dt, "s")
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
+        self._averages = integrator == "midpoint" and not model.articulated  # with joints it is Euler's rule between half-way poses
         self.project_loops = bool(project_loops) and any(loop.distance is None for loop in model.loops)
         self.directions, self.rho_scale, self.strict = self.law.directions, positive_number("rho_scale", rho_scale), bool(strict)
         self.device = wp.get_device(device)
@@ -462,7 +463,7 @@ class Simulator:
     def _step_kernels(self) -> None:
         """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back."""
         k, h, b, scene = self._kernels, self.dt, self.model.num_bodies, [self.topology, self.parameters]
-        halves = self.model.articulated and self.integrator == "midpoint"
+        halves = self.integrator == "midpoint" and not self._averages
         self._refresh_bodies()
         if halves:
             self.launch(k.drift, [self.topology, self.mechanics, self.bodies, 0.5 * h, self.q, self.v], b)
@@ -489,15 +490,13 @@ class Simulator:
         if self.model.articulated and len(self.mechanics.row_kind):
             self.launch(k.joint_rows, [self.mechanics, self.bodies, self.q, self.v, h, self.rows])
         if self.bounces is not None:
-            self.launch(
-                k.bounce, [*scene, h, self.tolerance, int(self.integrator == "midpoint"), self.rows, self.bounces], self.model.max_contacts
-            )
+            self.launch(k.bounce, [*scene, h, self.tolerance, int(self._averages), self.rows, self.bounces], self.model.max_contacts)
         self._solve_kernels(self.everyone, self.num_everyone, self.status)
         if self.bounces is not None:
             self._judge_kernels()
         if self.model.articulated:
             self.launch(k.integrate, [self.topology, self.mechanics, self.bodies, 0.5 * h if halves else h, self.q, self.v], b)
-        elif self.integrator == "midpoint":
+        elif self._averages:
             self.launch(k.guard, [self.parameters, self.bodies, self.rows, self.next_velocity, h, self.tolerance, self.rounding])
             self.launch(k.integrate_midpoint, [*scene, self.bodies, self.next_velocity, self.wrench, h, self.q, self.v], b)
         else:
@@ -542,7 +541,7 @@ class Simulator:
     def _judge_kernels(self) -> None:
         """Where a rebound would raise the energy, the environment again with less restitution (kernels/restitution.py)."""
         k, bounces = self._kernels, self.bounces
-        step = [self.dt, self.tolerance, int(self.integrator == "midpoint")]
+        step = [self.dt, self.tolerance, int(self._averages)]
         answer = [*step, self.rows, bounces, self.unsolved, self.reason]
 
         def solve_again() -> None:
