@@ -85,7 +85,7 @@ def test_chain_converges_to_where_it_should_be():
 
 
 def test_midpoint_rule_with_joints_is_eulers_between_half_way_poses():
-    """From rest a ball beside a link has the same velocities by both, impacts with e = 0.5 included; its poses are means of two of Euler's."""
+    """A ball beside a link has the same velocities by both from rest, with e = 0.5 too; its poses are means of two of Euler's."""
     builder, material = wl.ModelBuilder(), wl.Material(0.0, 0.0, restitution=0.5)
     builder.add_plane(material=material)
     ball = builder.add_body(pose=(0, 0, 0.6, 0, 0, 0, 1), mass=2.0)
@@ -203,6 +203,13 @@ def bricard() -> wl.Model:
     for parent, child, point, axis in zip([-1, *bodies], [*bodies, -1], points, "zyxzyx", strict=True):
         hinge(builder, parent, child, point, axis, place, loop=child < 0)
     return builder.finalize()
+
+
+def test_no_projection_with_the_midpoint_rule():
+    """Said where there is a loop, and taken for nothing where there is none, as with Euler's rule."""
+    with pytest.raises(wl.WarpLcpError, match="project_loops is for integrator 'euler'"):
+        simulator(shipped("fourbar"), integrator="midpoint", project_loops=True)
+    assert not simulator(shipped("chain"), integrator="midpoint", project_loops=True).project_loops
 
 
 def test_bricards_mechanism_moves():

@@ -81,7 +81,9 @@ INFORMATIVE = Status.RESTITUTION_REDUCED
 
 @dataclass(frozen=True)
 class Contacts:
-    """Contacts of the last step, at its start position. E environments, R = Model.max_contacts, and room for
+    """Contacts of the last step, at its start position (with joints and integrator 'midpoint' half a step later).
+
+    E environments, R = Model.max_contacts, and room for
     the rows of joints.
 
     Entries from ``count`` on are stale, or rows of joints.
@@ -139,7 +141,8 @@ class Simulator:
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
         precision: 'float64' or 'float32', of state and solution.
         integrator: 'euler', q+ = q + h Gamma v+ (eq. 23), or 'midpoint', q+ = q + h Gamma (v + v+) / 2 but for bodies that
-            this would drive into others, with joints half before the forces of the step and half after: second order away from impacts.
+            this would drive into others, with joints half before the forces of the step and half after: second order away from impacts, where neither
+            damping nor drives act. What q and v are set to may then overlap by half of what v approaches by in a step.
         device: Warp device; None = Warp's default.
         project_loops: bring joints that close loops back together after each step (not with 'midpoint'). Without it they are apart by
             what a step opens them, of second order in dt, which does not grow.
@@ -182,13 +185,13 @@ class Simulator:
         _choice("method", method, tuple(METHODS))
         _choice("precision", precision, tuple(PRECISIONS))
         _choice("integrator", integrator, INTEGRATORS)
-        if model.articulated and integrator == "midpoint" and project_loops:
-            raise WarpLcpError("project_loops is for integrator 'euler': with joints 'midpoint' closes loops half a step ahead")
         self.model, self.num_envs, self.dt = model, whole_number("num_envs", num_envs, 1), positive_number("dt", dt, "s")
         self.formulation, self.method, self.sliding, self.precision = formulation, method, sliding, precision
         self.integrator = integrator
         self._averages = integrator == "midpoint" and not model.articulated  # with joints it is Euler's rule between half-way poses
         self.project_loops = bool(project_loops) and any(loop.distance is None for loop in model.loops)
+        if self.project_loops and integrator == "midpoint":
+            raise WarpLcpError("project_loops is for integrator 'euler': with joints 'midpoint' closes loops half a step ahead")
         self.directions, self.rho_scale, self.strict = self.law.directions, positive_number("rho_scale", rho_scale), bool(strict)
         self.device = wp.get_device(device)
         self.real, self._numpy_real = PRECISIONS[precision]
