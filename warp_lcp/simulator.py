@@ -83,8 +83,7 @@ INFORMATIVE = Status.RESTITUTION_REDUCED
 class Contacts:
     """Contacts of the last step, at its start position (with joints and integrator 'midpoint' half a step later).
 
-    E environments, R = Model.max_contacts, and room for
-    the rows of joints.
+    E environments, R = Model.max_contacts, and room for the rows of joints.
 
     Entries from ``count`` on are stale, or rows of joints.
 
@@ -141,8 +140,8 @@ class Simulator:
         rho_scale: alpha of the phantom inertia rho_j = alpha (E^T A^-1 E)_jj; any positive number gives the same motion.
         precision: 'float64' or 'float32', of state and solution.
         integrator: 'euler', q+ = q + h Gamma v+ (eq. 23), or 'midpoint', q+ = q + h Gamma (v + v+) / 2 but for bodies that
-            this would drive into others, with joints half before the forces of the step and half after: second order away from impacts, where neither
-            damping nor drives act. What q and v are set to may then overlap by half of what v approaches by in a step.
+            this would drive into others, with joints half before the forces of the step and half after: second order away from
+            impacts, where neither damping nor drives act. A v that is set may then close a gap by h v / 2 once.
         device: Warp device; None = Warp's default.
         project_loops: bring joints that close loops back together after each step (not with 'midpoint'). Without it they are apart by
             what a step opens them, of second order in dt, which does not grow.
