@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import warp as wp
-from warp_lcp.kernels import contact_problem, lcp, projection, record, solve_batch, tree, watch
+from warp_lcp.kernels import articulated, contact_problem, lcp, projection, record, solve_batch, watch
 
 import warp_lcp as wl
 from warp_lcp.methods import METHODS
@@ -68,7 +68,7 @@ def kernels(precision: str) -> dict[str, wp.Kernel]:
     real = PRECISIONS[precision][0]
     found = {"collect_status": watch.collect_status, "solve_contacts": contact_problem.make(real)}
     found |= {name: part for name, part in vars(record.make(real)).items() if isinstance(part, wp.Kernel)}
-    found |= {"dynamics": tree.make(real).dynamics, "project": projection.make(real)}
+    found |= {"dynamics": articulated.make(real).dynamics, "project": projection.make(real)}
     found |= {f"solve_batch[{method}]": solve_batch.make(real, method) for method in solve_batch.SOLVERS}
     found |= {f"assembled_lcp[{method}]": lcp.make(real, method) for method in ("lemke", "murty", "judice_pires")}
     generators = ("lemke", "murty", "judice_pires")

@@ -18,6 +18,7 @@ import warp as wp
 from . import articulation, hulls
 from .errors import SimulationError, WarpLcpError, positive_number, whole_number
 from .kernels import (
+    articulated,
     bodies,
     box_box,
     capsule,
@@ -426,7 +427,7 @@ class Simulator:
 
     def _dynamics(self) -> tuple[wp.array, wp.array]:
         """M and c, by the functions of a step of trees, as which free bodies are looked at as well."""
-        k, n = tree.make(self.real), self.model.nv
+        k, n = articulated.make(self.real), self.model.nv
         if self.trees is None:
             self.trees = articulation.arrays(self, tree.functions(self.real).Trees)
             self._load([k.kinematics])
@@ -710,7 +711,7 @@ class Simulator:
 def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, bool]]]:
     """Kernels of the stages by name, and (kernel, number of pairs, does it take hulls?) for each kind of pair in the model."""
     rows, motion = contacts.make(real, model.articulated), integrate.make(real)
-    body = tree.make(real) if model.articulated else bodies.make(real)
+    body = articulated.make(real) if model.articulated else bodies.make(real)
     stages = SimpleNamespace(
         kinematics=body.kinematics,
         free_motion=body.free_motion,
