@@ -217,6 +217,8 @@ def run_stability(asked: argparse.Namespace) -> None:
         data, parts = joined(asked.data, "stability", "rows", "crowds")
         no_more_than_once(data["rows"], "case", "variant", "h")
         order = list(CASES)
+        if gone := {row["case"] for row in data["rows"]} - set(order):
+            raise SystemExit(f"python -m benchmarks: error: no case {sorted(gone)[0]!r} any more; leave its rows out")
         rows = sorted(data["rows"], key=lambda row: order.index(row["case"]))
         crowds = sorted(data["crowds"], key=lambda row: order.index(row["scene"]))
     else:

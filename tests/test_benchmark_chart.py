@@ -385,6 +385,8 @@ def test_parts_of_stability_are_joined(tmp_path, monkeypatch):
         kept.unlink()
     with pytest.raises(SystemExit, match=f"10 are in two of these files, the first: {names[6]}, default, 0.001"):
         join(part(names[6:]), part(names[:7]))
+    with pytest.raises(SystemExit, match="no case 'forgotten' any more"):
+        join(part(names), part(["forgotten"]))
 
 
 TABLES = {

@@ -75,9 +75,7 @@ def decomposition(name: str, points: np.ndarray, triangles: np.ndarray) -> tuple
         raise MissingExtra("decomposing meshes", "mesh", error) from error
     whole = mesh(name, points, triangles)
     coacd.set_log_level("error")
-    p = whole.points[whole.triangles] - whole.points.mean(axis=0)
-    outward = whole.triangles if np.linalg.det(p).sum() > 0.0 else whole.triangles[:, ::-1]  # of a mirrored mesh they are inside out
-    pieces = coacd.run_coacd(coacd.Mesh(whole.points, outward), seed=0)
+    pieces = coacd.run_coacd(coacd.Mesh(whole.points, whole.triangles), seed=0)  # the same for a mesh that is inside out
     found = [convex_hull(f"{name}[{i}]", corners)[0] for i, (corners, _) in enumerate(pieces)]
     beyond = np.min([_beyond(hull, whole.points[np.unique(whole.triangles)]) for hull in found], axis=0)
     return found, float(max(beyond.max(), 0.0))
