@@ -29,8 +29,10 @@ STIFF = wp.constant(0.01)
 # ... and where it is more than this part, the velocity is damped by this part of h times the stiffness.
 UNRESOLVED = wp.constant(1.0)
 CALM = wp.constant(0.1)
-# What rows changed a step ago they are expected to change again, unless it was more than this part of the largest velocity.
+# What rows changed a step ago they are expected to change again, unless it was more than this part of the largest velocity and more than
+# this many times what all else changed: it was a hit.
 LASTING = wp.constant(0.25)
+HIT = wp.constant(2.0)
 # Where a step does not resolve c, M_ii is this part larger for joints, which takes a third of their velocity.
 SLOWED = wp.constant(0.5)
 
@@ -348,16 +350,19 @@ def make(real) -> SimpleNamespace:
         """trees.expected := v and half of what rows changed of it a step ago, trees.twist with that; returns the largest of v.
 
         Loops and contacts that last change as much again, and c is that of the mean velocity of a step: of v and v+, not of v
-        and v_free. (A four-bar at 2 ms turns too far by 11 mrad in 2 s with the latter, by 0.02 with the former.) A hit does not.
+        and v_free. (A four-bar at 2 ms turns too far by 11 mrad in 2 s with the latter, by 0.02 with the former; what rests would
+        feel c of half of what its weight would give it in a step.) A hit does not last.
         """
         n = trees.before.shape[0]
         size = real(0.0)
         changed = real(0.0)
+        freely = real(0.0)  # what v_free was beyond what was expected then
         for i in range(n):
             size = wp.max(size, wp.abs(v[env, i]))
             changed = wp.max(changed, wp.abs(trees.held[env, i]))
+            freely = wp.max(freely, wp.abs(trees.free[env, i] - trees.expected[env, i]))
         part = real(0.0)
-        if changed <= real(LASTING) * size:
+        if changed <= wp.max(real(LASTING) * size, real(HIT) * freely):
             part = real(0.5)
         for i in range(n):
             trees.expected[env, i] = v[env, i] + part * trees.held[env, i]

@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from . import hulls, joints
+from . import hulls
 from .errors import ModelError, positive_number
-from .joints import AXES, Joint
-from .model import CONTACT_POINTS, JOINT_AXES, Combine, DofKind, Drive, Hull, JointType, Material, Mesh, Model, Report, ShapeType
+from .forest import IDENTITY, NO_DRIVE, NO_LIMIT, Body, arrange
+from .joints import AXES, Joint, compose
+from .model import CONTACT_POINTS, JOINT_AXES, Combine, Drive, Hull, JointType, Material, Mesh, Model, Report, ShapeType
 
-IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-NO_LIMIT, NO_DRIVE = (-np.inf, np.inf), (0.0, 0.0, np.inf, 0.0, 0.0)
-MOVED = 1e-5  # from here on it is told that a joint moves a body [m]
 CONTACT_FIELDS = ("normal_stiffness", "normal_damping", "tangent_stiffness", "tangent_damping", "slip_threshold")
 
 COMBINE_FIELDS = ("friction_combine", "restitution_combine")
@@ -33,18 +31,6 @@ def rotation_matrix(quat: np.ndarray) -> np.ndarray:
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-@dataclass
-class _Body:
-    name: str
-    joint: JointType
-    pose: np.ndarray
-    velocity: np.ndarray
-    angular_velocity: np.ndarray
-    mass: float | None
-    com: np.ndarray | None
-    inertia: np.ndarray | None
 
 
 @dataclass
@@ -115,7 +101,7 @@ class ModelBuilder:
     def __init__(self, gravity: Sequence[float] = (0.0, 0.0, -9.81), up_axis: str = "Z"):
         self.gravity = _vector("gravity", gravity, 3)
         self.up_axis = up_axis
-        self._bodies: list[_Body] = []
+        self._bodies: list[Body] = []
         self._shapes: list[_Shape] = []
         self._filtered: set[tuple[int, int]] = set()
         self._joints: list[Joint] = []
@@ -151,7 +137,7 @@ class ModelBuilder:
         if any(b.name == name for b in self._bodies):
             raise ModelError(f"{name}: a body of this name exists already; give each body its own name")
         self._bodies.append(
-            _Body(
+            Body(
                 name,
                 JointType(joint),
                 _pose(name, pose),
@@ -346,7 +332,7 @@ class ModelBuilder:
     def place_hull(self, body: int, hull: Hull, *, pose: Sequence[float] = IDENTITY, **options) -> int:
         """Add a hull that is known already; as :meth:`add_hull`."""
         middle, size = _bounds(hull.points)
-        where = joints.compose(_pose("hull", pose), np.r_[middle, IDENTITY[3:]]).tolist()
+        where = compose(_pose("hull", pose), np.r_[middle, IDENTITY[3:]]).tolist()
         return self._add_shape(ShapeType.HULL, body, where, size, hull=Hull(hull.points - middle, hull.faces), **options)
 
     def add_mesh(self, body: int, points: Any, triangles: Any, *, pose: Sequence[float] = IDENTITY, **options) -> int:
@@ -366,7 +352,7 @@ class ModelBuilder:
         name = options.get("name") or f"shape{len(self._shapes)}"
         mesh = hulls.mesh(name, points, triangles)
         middle, size = _bounds(mesh.points)
-        where = joints.compose(_pose("mesh", pose), np.r_[middle, IDENTITY[3:]]).tolist()
+        where = compose(_pose("mesh", pose), np.r_[middle, IDENTITY[3:]]).tolist()
         return self._add_shape(ShapeType.MESH, body, where, size, hull=Mesh(mesh.points - middle, mesh.triangles), **options)
 
     def add_box(
@@ -443,23 +429,12 @@ class ModelBuilder:
             raise ModelError("nothing can move: the scene has no free and no kinematic body; add one (in USD: PhysicsRigidBodyAPI)")
         mass, com, inertia = (np.array(x) for x in zip(*(self._mass_properties(i) for i in range(len(self._bodies))), strict=True))
         shapes = self._shapes
-        forest, moved, loops = self._forest(mass, com, inertia)
+        trees, notes = arrange(self._bodies, self._joints, {s.body for s in shapes}, mass, com, inertia)
         report = Report() if report is None else report
-        if moved:
-            far, worst = max(moved)
-            what = f"{len(moved)} bodies do" if len(moved) > 1 else f"{worst} does"
-            which = f", {worst} by {far:.3g} m" if len(moved) > 1 else f" by {far:.3g} m"
-            report = replace(report, notes=(*report.notes, f"{what} not stand where joints let them: moved there{which}"))
-        lost = [joint.name for joint in loops if joint.distance is None and _acts(joint)]
-        if lost:
-            what = "limits, drive, damping and dry friction act only on joints that carry a body"
-            report = replace(report, notes=(*report.notes, *(f"{name}: closes a loop: its {what}" for name in lost)))
+        if notes:
+            report = replace(report, notes=(*report.notes, *notes))
         model = Model(
-            body_names=tuple(b.name for b in self._bodies),
-            **forest,
-            mass=mass,
-            com=com,
-            inertia=inertia,
+            **trees,
             shape_names=tuple(s.name for s in shapes),
             shape_type=np.array([s.type for s in shapes], dtype=np.int32),
             shape_body=np.array([s.body for s in shapes], dtype=np.int32),
@@ -477,117 +452,6 @@ class ModelBuilder:
             report=report,
         )
         return replace(model, pairs=self._pairs(model))
-
-    def _forest(
-        self, mass: np.ndarray, com: np.ndarray, inertia: np.ndarray
-    ) -> tuple[dict[str, Any], list[tuple[float, str]], list[Joint]]:
-        """Model's fields of bodies, joints and coordinates, which are in the order of the tree, parents first; what joints move at the
-        start although they have no coordinate for it, by how much [m]; joints that close loops."""
-        bodies, count = self._bodies, len(self._bodies)
-        carried, order, loops = joints.forest([b.name for b in bodies], [b.joint for b in bodies], self._joints)
-        carries = {joint.parent for joint in carried if joint is not None}
-        for b, body in enumerate(bodies):
-            if body.mass == 0.0 and (carried[b] is None or b not in carries or any(s.body == b for s in self._shapes)):
-                raise ModelError(
-                    f"{body.name}: mass is 0 kg; only what hangs on a joint, carries another body and has no shape may have none"
-                )
-        types, parents = [b.joint for b in bodies], np.full(count, -1, dtype=np.int32)
-        frames, child_frames = np.tile(IDENTITY, (count, 1)), np.tile(IDENTITY, (count, 1))
-        poses = np.array([b.pose for b in bodies])
-        starts: dict[str, np.ndarray] = {"q_start": np.zeros(count, dtype=np.int32), "v_start": np.zeros(count, dtype=np.int32)}
-        q0: list[np.ndarray] = []
-        v0: list[np.ndarray] = []
-        dofs: list[tuple[Any, ...]] = []
-        joint_names, dof_names = [""] * count, list[str]()
-        axes: list[np.ndarray] = []  # [6, n] of each body's velocities, at the world's origin
-        by_inertia: list[int] = []  # drives that ask for accelerations
-        moved: list[tuple[float, str]] = []
-        carriers: dict[int, np.ndarray] = {}  # by which displacement a body is carried from where it was said to stand
-        twists = np.zeros((count + 1, 6))  # velocity at the world's origin, angular velocity; the world's own is the last
-        for b in order:
-            body, joint = bodies[b], carried[b]
-            starts["q_start"][b], starts["v_start"][b] = sum(map(len, q0)), len(dofs)
-            if joint is None:
-                if body.joint is JointType.FIXED:
-                    frames[b] = body.pose
-                    continue
-                kind = DofKind.FREE if body.joint is JointType.FREE else DofKind.PRESCRIBED
-                q0.append(body.pose)
-                v0.append(np.r_[body.velocity, body.angular_velocity])
-                dof_names += [body.name] * 6
-                dofs += [(b, kind, np.eye(3)[k % 3], 0.0, 0.0, 0.0, NO_LIMIT, NO_DRIVE) for k in range(6)]
-                centre = body.pose[:3] + joints.rotate(body.pose[3:], com[b])
-                turns = np.r_[np.cross(centre, np.eye(3)).T, np.eye(3)]
-                axes.append(np.c_[np.eye(6, 3), turns] if kind is DofKind.FREE else np.zeros((6, 6)))
-                twists[b] = np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
-                continue
-            types[b], parents[b], frames[b], child_frames[b] = joint.type, joint.parent, joint.parent_frame, joint.child_frame
-            if joint.type is JointType.FIXED:  # one frame is enough
-                frames[b], child_frames[b] = joints.compose(joint.parent_frame, joints.inverse(joint.child_frame)), np.array(IDENTITY)
-            frame = joint.parent_frame if joint.parent < 0 else joints.compose(poses[joint.parent], joint.parent_frame)
-            # What a joint with a given coordinate carries stands as if carried there.
-            carried_by = carriers.get(joint.parent)
-            asked_pose = body.pose if carried_by is None else joints.compose(carried_by, body.pose)
-            q = joints.coordinates(joint, joints.compose(joints.inverse(frame), joints.compose(asked_pose, joint.child_frame)))
-            if joint.start is not None:
-                q = np.where(np.isnan(joint.start), q, joint.start)
-            placed = joints.compose(frame, joints.pose_of(joint, q))
-            poses[b] = joints.compose(placed, joints.inverse(joint.child_frame))
-            if joint.start is None:  # the child's frame is the joint's: what turns there does not count as moved
-                away = float(np.linalg.norm(placed[:3] - joints.compose(asked_pose, joint.child_frame)[:3]))
-                if away > MOVED:
-                    moved.append((away, body.name))
-            if joint.start is not None:
-                carried_by = joints.compose(poses[b], joints.inverse(body.pose))
-            if carried_by is not None:
-                carriers[b] = carried_by
-            columns = joints.columns(joint, frame, q)
-            centre = poses[b][:3] + joints.rotate(poses[b][3:], com[b])
-            asked = np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
-            v = np.linalg.lstsq(columns, asked - twists[joint.parent], rcond=None)[0] if any(asked) else np.zeros(columns.shape[1])
-            if joint.start_velocity is not None:
-                v = np.where(np.isnan(joint.start_velocity), v, joint.start_velocity)
-            twists[b] = twists[joint.parent] + columns @ v
-            q0.append(q)
-            v0.append(v)
-            axis = joints.directions(joint)
-            axes.append(columns)
-            if joint.acceleration is not None:
-                by_inertia += (len(dofs) + np.flatnonzero(joint.acceleration)).tolist()
-            joint_names[b], dof_names = joint.name, [*dof_names, *(joint.names or [joint.name] * len(axis))]
-            numbers = (joint.armature, joint.damping, joint.friction, joint.limit, joint.drive)
-            dofs += list(zip([b] * len(axis), joints.kinds(joint), axis, *numbers, strict=True))
-        columns_of = list(zip(*dofs, strict=True))
-        drive = np.array(columns_of[7], dtype=float).reshape(-1, 5)
-        if by_inertia:
-            owner, armature = np.array(columns_of[0]), np.array(columns_of[3], dtype=float)
-            matrix = joints.mass_matrix(parents, order, owner, np.concatenate(axes, axis=1), poses, mass, com, inertia)
-            matrix[np.diag_indices(len(owner))] += armature
-            drive[by_inertia, :2] /= np.linalg.inv(matrix)[by_inertia, by_inertia, None]
-        return (
-            {
-                "body_parent": parents,
-                "joint_names": tuple(joint_names),
-                "dof_names": tuple(dof_names),
-                "joint_type": np.array(types, dtype=np.int32),
-                "joint_pose": frames,
-                "joint_child_pose": child_frames,
-                **starts,
-                "q0": np.concatenate(q0),
-                "v0": np.concatenate(v0),
-                "dof_body": np.array(columns_of[0], dtype=np.int32),
-                "dof_kind": np.array(columns_of[1], dtype=np.int32),
-                "dof_axis": np.array(columns_of[2], dtype=float),
-                "armature": np.array(columns_of[3], dtype=float),
-                "damping": np.array(columns_of[4], dtype=float),
-                "joint_friction": np.array(columns_of[5], dtype=float),
-                "limit": np.array(columns_of[6], dtype=float).reshape(-1, 2),
-                "drive": drive,
-                "loops": tuple(joints.loop_of(joint) for joint in loops),
-            },
-            moved,
-            loops,
-        )
 
     @property
     def welded(self) -> set[int]:
@@ -623,7 +487,7 @@ class ModelBuilder:
 
     def _pairs(self, model: Model) -> np.ndarray:
         moves = model.movable
-        welded = np.arange(len(self._bodies) + 1)  # first of the bodies that hang rigidly on each other; they do not touch
+        welded = np.arange(model.num_bodies + 1)  # first of the bodies that hang rigidly on each other; they do not touch
         for b in model.order:
             if model.joint_type[b] == JointType.FIXED and model.body_parent[b] >= 0:
                 welded[b] = welded[model.body_parent[b]]
@@ -675,11 +539,6 @@ def _axes(name: str, given: tuple[Any, ...]) -> tuple[tuple[str, ...], np.ndarra
     if not length.all() or len(given) > 6:
         raise ModelError(f"{name}: axes are {given}; give six at most, none of no length")
     return tuple(kind for kind, _ in given), vectors / length[:, None]
-
-
-def _acts(joint: Joint) -> bool:
-    """Does anything but what it holds act along the joint?"""
-    return bool(np.isfinite(joint.limit).any() or joint.drive[:, :2].any() or joint.damping.any() or joint.friction.any())
 
 
 def _start(what: str, value: float | Sequence[float], n: int) -> np.ndarray:

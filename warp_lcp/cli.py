@@ -168,9 +168,11 @@ def _model_facts(model: Model, law: Law) -> dict[str, Any]:
 
     bodies, shapes = [], []
     own = np.bincount(model.dof_body[model.dof_kind != DofKind.PRESCRIBED], minlength=model.num_bodies)
-    for b, name in enumerate(model.body_names):
-        joint, mass = JointType(model.joint_type[b]).name.lower(), float(model.mass[b]) if model.movable[b] else None
-        bodies.append({"name": name, "joint": joint, "mass": mass, "dofs": int(own[b])})
+    mass = np.bincount(model.part_of, model.mass, model.num_bodies)
+    for b in model.scene_bodies:
+        joint = JointType(model.joint_type[b]).name.lower()
+        weight = float(mass[b]) if model.movable[b] else None
+        bodies.append({"name": model.body_names[b], "joint": joint, "mass": weight, "dofs": int(own[b])})
     for name, kind, body in zip(model.shape_names, model.shape_type, model.shape_body, strict=True):
         shapes.append({"name": name, "type": ShapeType(kind).name.lower(), "body": model.body_names[body] if body >= 0 else None})
     pairs = [[model.shape_names[a], model.shape_names[b]] for a, b in model.pairs]
@@ -492,14 +494,15 @@ class Tally:
 class Recorder:
     """Rows for --out: the state at t = 0 and then every so many steps, on the host, allocated once.
 
-    T rows, E environments, B bodies: time [T] s, pose [T, E, B, 7] (x y z qx qy qz qw), velocity [T, E, B, 6] (of the
+    T rows, E environments, B bodies of the scene: time [T] s, pose [T, E, B, 7] (x y z qx qy qz qw), velocity [T, E, B, 6] (of the
     centre of mass, angular; world axes), status [T, E] and iterations [T, E] of all steps since the row before,
     residual [T, E] m/s of the last of them.
     """
 
     def __init__(self, sim: Simulator, steps: int, every: int):
         self.sim, self.every, self.rows = sim, every, 0
-        total, e, b = steps // every + 1, sim.num_envs, sim.model.num_bodies
+        self.bodies = sim.model.scene_bodies
+        total, e, b = steps // every + 1, sim.num_envs, len(self.bodies)
         real = sim.residual.numpy().dtype
         layout = {"time": ((), np.dtype(float)), "pose": ((e, b, 7), real), "velocity": ((e, b, 6), real)}
         layout |= {"status": ((e,), np.dtype(np.int32)), "residual": ((e,), real), "iterations": ((e,), np.dtype(np.int32))}
@@ -515,7 +518,8 @@ class Recorder:
 
     def add(self) -> None:
         sim = self.sim
-        row: dict[str, Any] = {"time": sim.time, "pose": sim.body_pose.numpy(), "velocity": sim.body_velocity.numpy()}
+        row: dict[str, Any] = {"time": sim.time}
+        row |= {"pose": sim.body_pose.numpy()[:, self.bodies], "velocity": sim.body_velocity.numpy()[:, self.bodies]}
         row |= {name: getattr(sim, name).numpy() for name in ("status", "residual", "iterations")}
         for name, value in row.items():
             self.arrays[name][self.rows] = value
@@ -531,7 +535,7 @@ def _memory() -> float:
 
 
 def _save(path: Path, recorder: Recorder) -> None:
-    names = np.array(recorder.sim.model.body_names, dtype=np.str_)
+    names = np.array(recorder.sim.model.body_names, dtype=np.str_)[recorder.bodies]
     try:
         with path.open("wb") as file:
             np.savez(file, body_names=names, **{name: a[: recorder.rows] for name, a in recorder.arrays.items()})  # type: ignore[arg-type]

@@ -18,18 +18,36 @@ HEADER = ("joint", "type", "from", "to", "axis", "range", "start", "drive", "arm
 
 
 def describe(model: Model) -> list[dict[str, Any]]:
-    """Joints in the order of the model's bodies, then those that close loops, ready for JSON; SI units."""
+    """Joints in the order of the model's bodies, then those that close loops, ready for JSON; SI units.
+
+    What carries a part of a body is said to carry the body, and to close a loop where that part is welded to the rest.
+    """
+    welded = {loop.bodies[1] for loop in model.loops if _within(model, loop)}
     found = []
     for b, name in enumerate(model.joint_names):
         if name:
-            ends = {"from": _body(model, model.body_parent[b]), "to": model.body_names[b]}
+            ends = {"from": _body(model, _carrier(model, b)), "to": _body(model, b), "loop": b in welded}
             kind = JointType(model.joint_type[b]).name.lower()
-            found.append({"name": name, "type": kind, **ends, "loop": False, "held": None, "distance": None, "axes": _axes(model, b)})
-    return found + [_loop(model, loop) for loop in model.loops]
+            found.append({"name": name, "type": kind, **ends, "held": None, "distance": None, "axes": _axes(model, b)})
+    return found + [_loop(model, loop) for loop in model.loops if not _within(model, loop)]
+
+
+def _within(model: Model, loop: Loop) -> bool:
+    """Does it hold parts of one body together?"""
+    a, b = loop.bodies
+    return min(a, b) >= 0 and bool(model.part_of[a] == model.part_of[b])
+
+
+def _carrier(model: Model, body: int) -> int:
+    """The first body above this one that is no part of the same."""
+    above = int(model.body_parent[body])
+    while above >= 0 and model.part_of[above] == model.part_of[body]:
+        above = int(model.body_parent[above])
+    return above
 
 
 def _body(model: Model, body: int) -> str | None:
-    return None if body < 0 else model.body_names[body]
+    return None if body < 0 else model.body_names[model.part_of[body]]
 
 
 def _axes(model: Model, body: int) -> list[dict[str, Any]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From bodies and the joints between them to a forest of kinematic trees: which joint carries which body, and where it stands.
+"""Joints between two bodies: what they leave free, coordinates to poses and back, and how velocities move what they carry.
 
 A joint is a sequence of ways and turns, each along or about an axis as moved by those before it. Those of D6 joints lie along the axes of
 the frame, ways first; where ``Joint.directions`` says so they lie anywhere, in any order.
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .errors import ModelError
-from .model import DofKind, JointType, Loop, parents_first
+from .model import DofKind, JointType
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 SEARCH_ROUNDS = 100  # of coordinates nearest to a pose
@@ -198,49 +198,10 @@ def mass_matrix(
     return matrix
 
 
-def forest(names: list[str], types: list[JointType], joints: list[Joint]) -> tuple[list[Joint | None], list[int], list[Joint]]:
-    """Joint that carries each body (None: free, kinematic or fixed), bodies with parents first, joints that close loops.
-
-    Bodies that are joined to the world, or to a body that forces do not move, hang there; of others the first one is free and carries
-    the rest. Breadth first, so that loops are cut far from the root.
-    """
-    neighbours: dict[int, list[tuple[Joint, int]]] = {b: [] for b in range(-1, len(names))}
-    for joint in (joint for joint in joints if not joint.loop):
-        neighbours[joint.parent].append((joint, joint.child))
-        neighbours[joint.child].append((joint, joint.parent))
-    carried: dict[int, Joint | None] = {-1: None}
-    used: set[int] = set()
-
-    def spread(roots: list[int]) -> None:
-        queue = list(roots)
-        while queue:
-            b = queue.pop(0)
-            for joint, other in neighbours[b]:
-                if other not in carried:
-                    carried[other] = joint if joint.child == other else turned(joint)
-                    used.add(id(joint))
-                    queue.append(other)
-
-    still = [b for b, kind in enumerate(types) if kind is not JointType.FREE]
-    for b in still:
-        carried[b] = None
-    spread([-1, *still])
-    for b in range(len(names)):
-        if b not in carried:
-            carried[b] = None
-            spread([b])
-    above = [carried[b] for b in range(len(names))]
-    order = parents_first([-1 if joint is None else joint.parent for joint in above])
-    return above, order, [joint for joint in joints if id(joint) not in used]
-
-
-def loop_of(joint: Joint) -> Loop:
-    """The same joint as a constraint."""
-    if joint.directions is not None:
-        raise ModelError(f"{joint.name}: a joint of stacked axes cannot close a loop; let one of its bodies hang on it")
-    x, y, z, rx, ry, rz = (axis not in joint.axes for axis in AXES)
-    frames = np.array([joint.parent_frame, joint.child_frame])
-    return Loop(joint.name, (joint.parent, joint.child), frames, (x, y, z), (rx, ry, rz), joint.distance)
+def acts(joint: Joint) -> bool:
+    """Does anything act along the joint's coordinates?"""
+    along = (np.isfinite(joint.limit), joint.drive[:, :2], joint.armature, joint.damping, joint.friction)
+    return any(bool(values.any()) for values in along)
 
 
 def turned(joint: Joint) -> Joint:

@@ -258,6 +258,8 @@ class Model:
 
     Attributes:
         body_names: name or prim path of each body.
+        part_of: [B] the body of the scene that each one is a part of, itself where it is one. Of several axes that do not meet each but
+            the last carries a part without mass; a joint that closes a loop and is limited, driven or damped carries a share of a body.
         body_parent: [B] index of the parent body, -1 = world.
         joint_type: [B] :class:`JointType` of the joint above each body. joint_names: [B] its name, empty where it is none of the scene's.
         joint_pose: [B, 7] frame of that joint in the parent's frame (identity under a FREE or KINEMATIC joint).
@@ -291,6 +293,7 @@ class Model:
     """
 
     body_names: tuple[str, ...]
+    part_of: np.ndarray
     body_parent: np.ndarray
     joint_names: tuple[str, ...]
     joint_type: np.ndarray
@@ -337,6 +340,11 @@ class Model:
     @property
     def num_bodies(self) -> int:
         return len(self.body_names)
+
+    @property
+    def scene_bodies(self) -> np.ndarray:
+        """[N] bodies that the scene has, without parts of them that joints needed."""
+        return np.flatnonzero(self.part_of == np.arange(self.num_bodies))
 
     @property
     def num_shapes(self) -> int:

@@ -1,0 +1,238 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What acts along joints that close loops: limits, drives, damping and dry friction, against closed forms and the loop cut elsewhere."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import GRAVITY, simulator
+from scipy.optimize import brentq
+from test_joint_scenes import hinge, openings, rod
+from test_usd import JOINT, SCENE, layer, load
+from test_usd_joints import joint, pair
+
+import warp_lcp as wl
+from warp_lcp.cli import main
+from warp_lcp.model import Drive, JointType
+
+pytest.importorskip("pxr", reason="needs the extra 'usd'")
+
+CRANK, CRANK_MASS, COUPLER_MASS = 0.4, 0.5, 2.0
+INERTIA = (2 * CRANK_MASS / 3 + COUPLER_MASS) * CRANK**2  # of the parallelogram, by its crank's angle
+WEIGHT = (COUPLER_MASS + CRANK_MASS) * CRANK * GRAVITY  # N m at a right angle
+
+
+def parallelogram(lean: float, elsewhere: bool = False, gravity: bool = True, **options) -> wl.Model:
+    """Two cranks and a coupler that stays level; `options` act along the hinge of coupler and second crank, whose angle is the crank's.
+
+    That hinge closes the loop or, `elsewhere`, the second crank's on the ground does.
+    """
+    builder = wl.ModelBuilder() if gravity else wl.ModelBuilder(gravity=(0, 0, 0))
+    feet, up = np.array([[0.0, 0, 0], [1.0, 0, 0]]), CRANK * np.array([np.sin(lean), 0, np.cos(lean)])
+    bodies = [rod(builder, foot, foot + up, CRANK_MASS) for foot in feet]
+    bodies.append(rod(builder, feet[0] + up, feet[1] + up, COUPLER_MASS))
+    place = {bodies[0]: feet[0] + 0.5 * up, bodies[1]: feet[1] + 0.5 * up, bodies[2]: feet.mean(axis=0) + up}
+    hinge(builder, -1, bodies[0], feet[0], "y", place)
+    hinge(builder, -1, bodies[1], feet[1], "y", place, loop=elsewhere)
+    hinge(builder, bodies[0], bodies[2], feet[0] + up, "y", place)
+    hinge(builder, bodies[2], bodies[1], feet[1] + up, "y", place, loop=not elsewhere, name="hinge", **options)
+    return builder.finalize()
+
+
+def turned(model: wl.Model, seconds: float, h: float, rate: float = 0.0) -> np.ndarray:
+    """[T, 2] angle of the first crank from its start and angular velocity, all steps certified."""
+    sim = simulator(model, dt=h)
+    sim.v.assign(rate * np.array([[-1.0 if name == "joint2" else 1.0 for name in model.dof_names]]))  # the coupler's turns it back
+    moved = sim.rollout(round(seconds / h), record=("q", "v", "status", "residual"))
+    assert not moved.status.numpy().any()
+    assert moved.residual.numpy().max() < 1e-6
+    return np.stack([moved.q.numpy()[:, 0, 0], moved.v.numpy()[:, 0, 0]], axis=1)
+
+
+def test_a_part_of_a_body_is_carried():
+    """Mass and centre stay those of the whole; the scene's bodies are told apart from parts."""
+    plain, acting = parallelogram(0.2), parallelogram(0.2, damping=0.1)
+    assert (plain.num_bodies, acting.num_bodies) == (3, 4)
+    assert acting.part_of.tolist() == [0, 1, 2, 1]
+    assert acting.scene_bodies.tolist() == [0, 1, 2]
+    assert acting.mass.tolist() == [CRANK_MASS, CRANK_MASS / 2, COUPLER_MASS, CRANK_MASS / 2]
+    assert acting.inertia[1] == pytest.approx(0.5 * plain.inertia[1])
+    assert acting.inertia[3] == pytest.approx(0.5 * plain.inertia[1])
+    assert acting.dof_names[-1] == "hinge"
+    (weld,) = acting.loops
+    assert (weld.bodies, weld.ways, weld.turns) == ((1, 3), (True,) * 3, (True,) * 3)
+    assert "hinge: closes a loop" in " ".join(acting.report.notes)
+    assert not plain.report.notes
+
+
+def test_loops_are_cut_where_nothing_acts():
+    """If a joint of the loop only holds, it is the one that closes the loop, and no body is parted."""
+    builder = wl.ModelBuilder()
+    bodies = [builder.add_body(pose=(x, 0, 0, 0, 0, 0, 1), mass=1.0, inertia=np.eye(3)) for x in (0.0, 1.0, 2.0)]
+    place = {body: np.array([x, 0.0, 0.0]) for body, x in zip(bodies, (0.0, 1.0, 2.0), strict=True)}
+    ends = [(-1, 0, 0.0), (-1, 2, 2.0), (0, 1, 0.5), (1, 2, 1.5)]
+    for k, (a, b, x) in enumerate(ends):
+        hinge(builder, a, b, np.array([x, 0, 0]), "y", place, damping=0.1 * (k in (0, 2, 3)), name=str(k))
+    model = builder.finalize()
+    assert model.num_bodies == 3
+    assert [loop.name for loop in model.loops] == ["1"]
+    assert model.damping.tolist() == [0.1] * 3
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_limit_of_what_closes_a_loop(elsewhere):
+    """The mechanism falls until the limit holds it, at 0.5 rad but for what limits and loops give under 20 N: 1e-10 m a N and 0.1 kg."""
+    path = turned(parallelogram(0.2, elsewhere, limit=(-1.0, 0.5), damping=0.05), 3.0, 2e-3)
+    assert path[-1, 0] == pytest.approx(0.5, abs=1e-7)
+    assert abs(path[-1, 1]) < 1e-9
+    assert path[:, 0].max() < 0.5 + 5e-6  # the impact: a thousandth of the way of a step
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_drive_of_what_closes_a_loop(elsewhere):
+    """It stands where the spring of the drive and the weight agree, a root of one equation."""
+    k = 40.0
+    known = brentq(lambda x: WEIGHT * np.sin(0.2 + x) - k * (x - 0.1), 0.0, 1.0, xtol=1e-14)
+    path = turned(parallelogram(0.2, elsewhere, drive=Drive(k, 8.0, np.inf, 0.1)), 6.0, 5e-3)
+    assert path[-1, 0] == pytest.approx(known, abs=1e-7)
+    assert abs(path[-1, 1]) < 1e-8
+
+
+@pytest.mark.parametrize(("share", "holds"), [(1.02, True), (0.98, False)])
+def test_drive_of_limited_force_holds_a_loop_or_does_not(share, holds):
+    """With 1.02 times the torque of its weight it stands; with 0.98 times it falls, I x'' = W sin(lean + x) - F, here linear in x."""
+    model = parallelogram(0.2, drive=Drive(1e6, 1e5, share * WEIGHT * np.sin(0.2)))
+    path = turned(model, 0.2, 1e-3)
+    if holds:
+        assert np.abs(path[:, 0]).max() < 1e-5  # what its spring gives
+    else:
+        rate = np.sqrt(WEIGHT * np.cos(0.2) / INERTIA)
+        known = 0.02 * WEIGHT * np.sin(0.2) / INERTIA * np.sinh(rate * 0.2) / rate
+        assert path[-1, 1] == pytest.approx(known, rel=5e-3)
+
+
+@pytest.mark.parametrize("what", ["friction", "damping"])
+def test_friction_and_damping_of_what_closes_a_loop(what):
+    """Without weight: dry friction stops it after w I / F and an angle of w^2 I / 2 F, damping lets w fall as exp(-b t / I).
+
+    Of first order: dry friction stops in the middle of a step, w h at most; damping is implicit, b / I h of w.
+    """
+    rate, amount = 1.0, 0.5
+    for h in (4e-3, 2e-3, 1e-3):
+        path = turned(parallelogram(-0.5, gravity=False, **{what: amount}), 1.5, h, rate)
+        if what == "friction":
+            assert path[-1, 0] == pytest.approx(rate**2 * INERTIA / (2 * amount), abs=0.6 * rate * h)
+            assert abs(path[-1, 1]) < 1e-8
+        else:
+            assert path[-1, 1] == pytest.approx(rate * np.exp(-amount * 1.5 / INERTIA), abs=2.0 * h)
+
+
+def test_where_the_loop_is_cut_makes_no_difference():
+    """A swinging mechanism, driven, damped and limited, cut at one hinge or another: apart by what loops and limits give."""
+    options = {"drive": Drive(30.0, 0.5, 12.0, 0.3), "limit": (-0.6, 0.9), "friction": 0.05}
+    for h in (2e-3, 5e-4):
+        paths = [turned(parallelogram(0.3, elsewhere, **options), 1.0, h)[:, 0] for elsewhere in (False, True)]
+        assert np.ptp(paths[0]) > 0.5
+        assert np.abs(paths[0] - paths[1]).max() < 1e-4
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_what_closes_a_loop_does_not_throw_back_an_impact(elsewhere):
+    """At 1 rad/s against a limit, which stops it, at any step: 1e-4 comes back at most. (Loops of Table 1's stiffness gave back an eighth
+    at 0.1 ms, 0.3 % at 1 ms.)"""
+    model = parallelogram(-0.5, elsewhere, gravity=False, limit=(-1.0, 0.3))
+    for h in (1e-2, 1e-3, 1e-4):
+        assert abs(turned(model, 0.4, h, 1.0)[-1, 1]) < 1e-4
+
+
+def test_the_weld_stays_closed():
+    """A part parts from its whole as little as a loop opens, 1e-6 m, and under 1e-8 m where loops are projected."""
+    model = parallelogram(0.3, limit=(-0.6, 0.9))
+    for options, most in (({}, 2e-5), ({"project_loops": True}, 1e-8)):
+        moved = simulator(model, dt=1e-3, **options).rollout(1000, record=("body_pose", "status"))
+        assert not moved.status.numpy().any()
+        assert openings(model, moved)[1:].max() < most
+
+
+def test_stacked_axes_may_close_a_loop():
+    """Damped ways in a plane beside the hinge that lets a pendulum move in it: as a hinge whose damper acts on the arm of its centre."""
+    h, damping, paths = 1e-3, 0.7, []
+    for stacked in (True, False):
+        builder = wl.ModelBuilder()
+        bob = builder.add_body(pose=(0.5, 0, 0, 0, 0, 0, 1), mass=1.0, inertia=0.02 * np.eye(3))
+        place = {bob: np.array([0.5, 0, 0])}
+        hinge(builder, -1, bob, np.zeros(3), "y", place, damping=0.0 if stacked else damping * 0.5**2)
+        if stacked:
+            axes = [("t", (1, 0, 1)), ("t", (1, 0, -1)), ("r", (0, 1, 0))]
+            frame = (0.5, 0, 0, 0, 0, 0, 1)
+            builder.add_joint(JointType.D6, -1, bob, parent_frame=frame, axes=axes, damping=(damping, damping, 0.0), loop=True)
+        sim = simulator(builder, dt=h)
+        moved = sim.rollout(1000, record=("q", "status"))
+        assert not moved.status.numpy().any()
+        paths.append(moved.q.numpy()[:, 0, 0])
+    assert np.abs(paths[0]).max() > 1.0
+    assert paths[0] == pytest.approx(paths[1], abs=2.0 * h)
+
+
+def test_a_loop_between_bodies_without_mass_is_told():
+    """What carries one of two axes has no mass, so that no part of it can be carried."""
+    builder = wl.ModelBuilder()
+    a, b = (builder.add_body(name, mass=0.0) for name in "ab")
+    end = builder.add_body("end", mass=1.0, inertia=np.eye(3))
+    for parent, child, axis in ((-1, a, "x"), (a, b, "y"), (b, end, "z")):
+        hinge(builder, parent, child, np.zeros(3), axis, {})
+    hinge(builder, a, b, np.zeros(3), "y", {}, loop=True, limit=(-1.0, 1.0), name="lost")
+    assert any(note.startswith("lost: closes a loop between bodies without mass") for note in builder.finalize().report.notes)
+
+
+# --------------------------------------------------------------------------------------------------------------------- USD
+
+
+def loop_stage() -> list[str]:
+    """A joint that closes a loop beside the hinge between A and B, with a limit of 10 degrees."""
+    frames = "point3f physics:localPos0 = (0.5, 0, 0); point3f physics:localPos1 = (-0.5, 0, 0);"
+    content = JOINT + frames + "bool physics:excludeFromArticulation = 1; float physics:lowerLimit = -180; float physics:upperLimit = 10;"
+    return [*pair("Revolute"), joint("Revolute", content, name="K")]
+
+
+def test_excluded_joint_with_a_limit():
+    """Both turn about the same axis: the limit of the one that closes the loop holds the other."""
+    model = load(*loop_stage())
+    assert model.body_names == ("/A", "/B", "/K:carried")
+    assert np.degrees(model.limit[-1]) == pytest.approx([-180, 10])
+    sim = simulator(model, dt=2e-3)
+    sim.v.assign(np.r_[np.zeros(6), 1.0, 1.0][None])
+    sim.step(100)
+    assert np.degrees(sim.q.numpy()[0, 7:]) == pytest.approx([10, 10], abs=1e-3)  # 1e-4 of the impact comes back
+    assert not sim.status.numpy().any()
+
+
+def test_parts_of_bodies_on_the_command_line(capsys, tmp_path):
+    """info lists joints and bodies of the scene, with their whole mass; --out holds them alone."""
+    scene, out = tmp_path / "loop.usda", tmp_path / "out.npz"
+    scene.write_text(layer(SCENE, *loop_stage()))
+    assert main(["info", str(scene), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert [(b["name"], b["mass"]) for b in facts["bodies"]] == [("/A", 2.0), ("/B", 2.0)]
+    assert [(j["name"], j["from"], j["to"], j["loop"]) for j in facts["joints"]] == [("/J", "/A", "/B", False), ("/K", "/A", "/B", True)]
+    assert facts["joint_row_kinds"] == {"limits": 2, "drives": 0, "friction": 0, "loops": 6, "distances": 0}
+    assert main(["run", str(scene), "--duration", "0.01", "--device", "cpu", "--out", str(out), "--json"]) == 0
+    capsys.readouterr()
+    saved = np.load(out)
+    assert saved["body_names"].tolist() == ["/A", "/B"]
+    assert saved["pose"].shape[2] == saved["velocity"].shape[2] == 2
+
+
+def test_boxes_fourbar_of_kamino(shared):
+    """All four hinges have limits of 45 degrees, the one that closes the loop too. Angles around the loop add up to nothing."""
+    model = wl.load_usd(shared / "usd/newton/kamino_boxes_fourbar.usda")
+    assert (len(model.scene_bodies), model.num_bodies, len(model.loops)) == (4, 5, 1)
+    assert np.degrees(model.limit[6:]) == pytest.approx(np.tile([-45.0, 45.0], (4, 1)), rel=1e-6)
+    sim = simulator(model, dt=2e-3)
+    moved = sim.rollout(1000, record=("q", "status", "body_pose"))
+    assert not moved.status.numpy().any()
+    assert openings(model, moved)[1:].max() < 1e-5
+    angles = dict(zip(model.dof_names[6:], moved.q.numpy()[:, 0, 7:].T, strict=True))
+    first, second, third, fourth = (angles[f"/boxes_fourbar/Joints/joint_{k}"] for k in (1, 2, 3, 4))
+    assert np.abs([first, second, third, fourth]).max() < np.radians(45) + 1e-6
+    assert np.abs(first + second + third + fourth).max() < 1e-5
