@@ -264,11 +264,12 @@ def test_loops_by_every_method(name, method):
 def test_loops_that_are_projected_stay_closed(name, seconds):
     """Under 1e-8 m in every step of 5 ms, also where loops hold more than they need; without, up to half a millimetre.
 
-    A table whose legs lie in one line with its top can fold either way: there it is under 1e-7 m, as without.
+    A table whose legs lie in one line with its top can fold either way: there it is open by 1e-7 m, as without, which is what relaxation
+    gives: 1e-5 h^2 times the 400 m/s^2 that legs ask of the top there.
     """
     model = {"fourbar": lambda: shipped("fourbar"), "bricard": bricard, "table": lambda: table(6)}[name]()
     moved = run(model, seconds, 5e-3, project_loops=True)
-    assert openings(model, moved)[1:].max() < (1e-7 if name == "table" else 1e-8)
+    assert openings(model, moved)[1:].max() < (1.5e-7 if name == "table" else 1e-8)
 
 
 def test_projected_fourbar_turns_as_it_should():

@@ -128,21 +128,20 @@ def test_friction_and_damping_of_what_closes_a_loop(what):
 
 
 def test_where_the_loop_is_cut_makes_no_difference():
-    """A swinging mechanism, driven, damped and limited, cut at one hinge or another: apart by what loops and limits give."""
+    """A swinging mechanism, driven, damped and limited, cut at one hinge or another: apart by what comes back of an impact."""
     options = {"drive": Drive(30.0, 0.5, 12.0, 0.3), "limit": (-0.6, 0.9), "friction": 0.05}
     for h in (2e-3, 5e-4):
         paths = [turned(parallelogram(0.3, elsewhere, **options), 1.0, h)[:, 0] for elsewhere in (False, True)]
         assert np.ptp(paths[0]) > 0.5
-        assert np.abs(paths[0] - paths[1]).max() < 1e-4
+        assert np.abs(paths[0] - paths[1]).max() < 3e-4
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_what_closes_a_loop_does_not_throw_back_an_impact(elsewhere):
-    """At 1 rad/s against a limit, which stops it, at any step: 1e-4 comes back at most. (Loops of Table 1's stiffness gave back an eighth
-    at 0.1 ms, 0.3 % at 1 ms.)"""
+    """At 1 rad/s against a limit, which stops it: 3e-4 come back, at any step. (Of loops of Table 1's stiffness an eighth at 0.1 ms.)"""
     model = parallelogram(-0.5, elsewhere, gravity=False, limit=(-1.0, 0.3))
     for h in (1e-2, 1e-3, 1e-4):
-        assert abs(turned(model, 0.4, h, 1.0)[-1, 1]) < 1e-4
+        assert abs(turned(model, 0.9, h, 1.0)[-1, 1]) < 4e-4
 
 
 def test_the_weld_stays_closed():
@@ -203,7 +202,7 @@ def test_excluded_joint_with_a_limit():
     sim = simulator(model, dt=2e-3)
     sim.v.assign(np.r_[np.zeros(6), 1.0, 1.0][None])
     sim.step(100)
-    assert np.degrees(sim.q.numpy()[0, 7:]) == pytest.approx([10, 10], abs=1e-3)  # 1e-4 of the impact comes back
+    assert np.degrees(sim.q.numpy()[0, 7:]) == pytest.approx([10, 10], abs=1e-3)  # 3e-4 of the impact comes back
     assert not sim.status.numpy().any()
 
 
