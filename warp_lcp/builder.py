@@ -12,7 +12,7 @@ import numpy as np
 
 from . import hulls
 from .errors import ModelError, positive_number
-from .forest import IDENTITY, NO_DRIVE, NO_LIMIT, Body, arrange
+from .forest import IDENTITY, NO_DRIVE, NO_LIMIT, Arrangement, Body
 from .joints import AXES, Joint, compose
 from .model import CONTACT_POINTS, JOINT_AXES, Combine, Drive, Hull, JointType, Material, Mesh, Model, Report, ShapeType
 
@@ -429,12 +429,12 @@ class ModelBuilder:
             raise ModelError("nothing can move: the scene has no free and no kinematic body; add one (in USD: PhysicsRigidBodyAPI)")
         mass, com, inertia = (np.array(x) for x in zip(*(self._mass_properties(i) for i in range(len(self._bodies))), strict=True))
         shapes = self._shapes
-        trees, notes = arrange(self._bodies, self._joints, {s.body for s in shapes}, mass, com, inertia)
+        arranged = Arrangement(self._bodies, self._joints, {s.body for s in shapes}, mass, com, inertia)
         report = Report() if report is None else report
-        if notes:
-            report = replace(report, notes=(*report.notes, *notes))
+        if arranged.notes:
+            report = replace(report, notes=(*report.notes, *arranged.notes))
         model = Model(
-            **trees,
+            **arranged.fields,
             shape_names=tuple(s.name for s in shapes),
             shape_type=np.array([s.type for s in shapes], dtype=np.int32),
             shape_body=np.array([s.body for s in shapes], dtype=np.int32),

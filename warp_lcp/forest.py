@@ -105,10 +105,8 @@ def loop_of(joint: Joint) -> Loop:
     return Loop(joint.name, (joint.parent, joint.child), frames, (x, y, z), (rx, ry, rz), joint.distance)
 
 
-def arrange(
-    bodies: list[Body], joints: list[Joint], shaped: Collection[int], mass: np.ndarray, com: np.ndarray, inertia: np.ndarray
-) -> tuple[dict[str, Any], list[str]]:
-    """Model's fields of bodies, joints and coordinates, which are in the order of the trees, parents first; what is to be told of it.
+class Arrangement:
+    """Bodies on their joints: gathers Model's fields of bodies, joints and coordinates from the roots on, parents first.
 
     Args:
         shaped: bodies that have shapes. mass, com, inertia: [B], [B, 3], [B, 3, 3] of the bodies.
@@ -116,129 +114,162 @@ def arrange(
     Raises:
         ModelError: for a body without mass that needs some.
     """
-    given = len(bodies)
-    bodies, joints = cut(bodies, joints, mass)
-    count, notes = len(bodies), list[str]()
-    carried, loops = spanning([b.joint for b in bodies], joints)
-    order = parents_first([-1 if joint is None else joint.parent for joint in carried])
-    carries = {joint.parent for joint in carried if joint is not None}
-    for b, body in enumerate(bodies):
-        if body.mass == 0.0 and (carried[b] is None or b not in carries or b in shaped):
-            raise ModelError(f"{body.name}: mass is 0 kg; only what hangs on a joint, carries another body and has no shape may have none")
-    whole = np.array([b if b < given else body.part_of for b, body in enumerate(bodies)])
-    share = 1.0 / np.bincount(whole)[whole]
-    com, entire = com[whole], (mass[whole], inertia[whole])
-    mass, inertia = share * entire[0], share[:, None, None] * entire[1]
-    for b in range(given, count):
-        of = f"a part of {bodies[whole[b]].name} that is welded to the rest"
-        notes.append(f"{bodies[b].name.removesuffix(':carried')}: closes a loop and has limits, drives or the like: it carries {of}")
-    lost = [joint.name for joint in loops if joint.distance is None and acts(joint)]
-    notes += [f"{name}: closes a loop between bodies without mass: its limits, drives and the like are left out" for name in lost]
-    types, parents = [b.joint for b in bodies], np.full(count, -1, dtype=np.int32)
-    frames, child_frames = np.tile(IDENTITY, (count, 1)), np.tile(IDENTITY, (count, 1))
-    poses = np.array([b.pose for b in bodies])
-    starts: dict[str, np.ndarray] = {"q_start": np.zeros(count, dtype=np.int32), "v_start": np.zeros(count, dtype=np.int32)}
-    q0: list[np.ndarray] = []
-    v0: list[np.ndarray] = []
-    dofs: list[tuple[Any, ...]] = []
-    joint_names, dof_names = [""] * count, list[str]()
-    axes: list[np.ndarray] = []  # [6, n] of each body's velocities, at the world's origin
-    by_inertia: list[int] = []  # drives that ask for accelerations
-    moved: list[tuple[float, str]] = []
-    carriers: dict[int, np.ndarray] = {}  # by which displacement a body is carried from where it was said to stand
-    twists = np.zeros((count + 1, 6))  # velocity at the world's origin, angular velocity; the world's own is the last
-    for b in order:
-        body, joint = bodies[b], carried[b]
-        starts["q_start"][b], starts["v_start"][b] = sum(map(len, q0)), len(dofs)
-        if joint is None:
-            if body.joint is JointType.FIXED:
-                frames[b] = body.pose
-                continue
-            kind = DofKind.FREE if body.joint is JointType.FREE else DofKind.PRESCRIBED
-            q0.append(body.pose)
-            v0.append(np.r_[body.velocity, body.angular_velocity])
-            dof_names += [body.name] * 6
-            dofs += [(b, kind, np.eye(3)[k % 3], 0.0, 0.0, 0.0, NO_LIMIT, NO_DRIVE) for k in range(6)]
-            centre = body.pose[:3] + rotate(body.pose[3:], com[b])
-            turns = np.r_[np.cross(centre, np.eye(3)).T, np.eye(3)]
-            axes.append(np.c_[np.eye(6, 3), turns] if kind is DofKind.FREE else np.zeros((6, 6)))
-            twists[b] = np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
-            continue
-        types[b], parents[b], frames[b], child_frames[b] = joint.type, joint.parent, joint.parent_frame, joint.child_frame
+
+    def __init__(
+        self, bodies: list[Body], joints: list[Joint], shaped: Collection[int], mass: np.ndarray, com: np.ndarray, inertia: np.ndarray
+    ):
+        self.given = len(bodies)
+        self.bodies, joints = cut(bodies, joints, mass)
+        count = len(self.bodies)
+        self.carried, self.loops = spanning([b.joint for b in self.bodies], joints)
+        self.order = parents_first([-1 if joint is None else joint.parent for joint in self.carried])
+        self._check_masses(shaped)
+        self.whole = np.array([b if b < self.given else body.part_of for b, body in enumerate(self.bodies)])
+        self.share = 1.0 / np.bincount(self.whole)[self.whole]
+        self.mass, self.com, self.inertia = mass[self.whole], com[self.whole], inertia[self.whole]  # a part has those of all of it here
+        self.types, self.parents = [b.joint for b in self.bodies], np.full(count, -1, dtype=np.int32)
+        self.frames, self.child_frames = np.tile(IDENTITY, (count, 1)), np.tile(IDENTITY, (count, 1))
+        self.poses = np.array([b.pose for b in self.bodies])
+        self.q_start, self.v_start = np.zeros(count, dtype=np.int32), np.zeros(count, dtype=np.int32)
+        self.q0: list[np.ndarray] = []
+        self.v0: list[np.ndarray] = []
+        self.dofs: list[tuple[Any, ...]] = []
+        self.joint_names, self.dof_names = [""] * count, list[str]()
+        self.axes: list[np.ndarray] = []  # [6, n] of each body's velocities, at the world's origin
+        self.by_inertia: list[int] = []  # drives that ask for accelerations
+        self.moved: list[tuple[float, str]] = []  # what joints move at the start, by how much [m]
+        self.carriers: dict[int, np.ndarray] = {}  # by which displacement a body is carried from where it was said to stand
+        self.twists = np.zeros((count + 1, 6))  # velocity at the world's origin, angular velocity; the world's own is the last
+        for b in self.order:
+            joint = self.carried[b]
+            self.q_start[b], self.v_start[b] = sum(map(len, self.q0)), len(self.dofs)
+            if joint is None:
+                self._stand(b)
+            else:
+                self._hang(b, joint)
+
+    def _check_masses(self, shaped: Collection[int]) -> None:
+        carries = {joint.parent for joint in self.carried if joint is not None}
+        for b, body in enumerate(self.bodies):
+            if body.mass == 0.0 and (self.carried[b] is None or b not in carries or b in shaped):
+                why = "only what hangs on a joint, carries another body and has no shape may have none"
+                raise ModelError(f"{body.name}: mass is 0 kg; {why}")
+
+    def _stand(self, b: int) -> None:
+        """A body that no joint carries: free, kinematic or fixed."""
+        body = self.bodies[b]
+        if body.joint is JointType.FIXED:
+            self.frames[b] = body.pose
+            return
+        kind = DofKind.FREE if body.joint is JointType.FREE else DofKind.PRESCRIBED
+        self.q0.append(body.pose)
+        self.v0.append(np.r_[body.velocity, body.angular_velocity])
+        self.dof_names += [body.name] * 6
+        self.dofs += [(b, kind, np.eye(3)[k % 3], 0.0, 0.0, 0.0, NO_LIMIT, NO_DRIVE) for k in range(6)]
+        centre = body.pose[:3] + rotate(body.pose[3:], self.com[b])
+        turns = np.r_[np.cross(centre, np.eye(3)).T, np.eye(3)]
+        self.axes.append(np.c_[np.eye(6, 3), turns] if kind is DofKind.FREE else np.zeros((6, 6)))
+        self.twists[b] = self._asked_twist(b, body.pose)
+
+    def _asked_twist(self, b: int, pose: np.ndarray) -> np.ndarray:
+        body = self.bodies[b]
+        centre = pose[:3] + rotate(pose[3:], self.com[b])
+        return np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
+
+    def _hang(self, b: int, joint: Joint) -> None:
+        """A body on the joint that carries it, at the coordinates nearest to where it was said to stand unless it has others."""
+        body, part = self.bodies[b], b >= self.given
+        self.types[b], self.parents[b] = joint.type, joint.parent
+        self.frames[b], self.child_frames[b] = joint.parent_frame, joint.child_frame
         if joint.type is JointType.FIXED:  # one frame is enough
-            frames[b], child_frames[b] = compose(joint.parent_frame, inverse(joint.child_frame)), np.array(IDENTITY)
-        frame = joint.parent_frame if joint.parent < 0 else compose(poses[joint.parent], joint.parent_frame)
-        # What a joint with a given coordinate carries stands as if carried there.
-        carried_by = carriers.get(joint.parent)
-        asked_pose = body.pose if carried_by is None else compose(carried_by, body.pose)
-        if b >= given:
-            asked_pose = poses[whole[b]]  # where the rest of it is
-        q = coordinates(joint, compose(inverse(frame), compose(asked_pose, joint.child_frame)))
+            self.frames[b] = compose(joint.parent_frame, inverse(joint.child_frame))
+            self.child_frames[b] = IDENTITY
+        frame = joint.parent_frame if joint.parent < 0 else compose(self.poses[joint.parent], joint.parent_frame)
+        # What a joint with a given coordinate carries stands as if carried there; a part of a body where the rest of it is.
+        carrier = self.carriers.get(joint.parent)
+        asked = self.poses[self.whole[b]] if part else body.pose if carrier is None else compose(carrier, body.pose)
+        q = coordinates(joint, compose(inverse(frame), compose(asked, joint.child_frame)))
         if joint.start is not None:
             q = np.where(np.isnan(joint.start), q, joint.start)
         placed = compose(frame, pose_of(joint, q))
-        poses[b] = compose(placed, inverse(joint.child_frame))
+        self.poses[b] = compose(placed, inverse(joint.child_frame))
         if joint.start is None:  # the child's frame is the joint's: what turns there does not count as moved
-            away = float(np.linalg.norm(placed[:3] - compose(asked_pose, joint.child_frame)[:3]))
+            away = float(np.linalg.norm(placed[:3] - compose(asked, joint.child_frame)[:3]))
             if away > MOVED:
-                moved.append((away, body.name))
-        if joint.start is not None:
-            carried_by = compose(poses[b], inverse(body.pose))
-        if carried_by is not None:
-            carriers[b] = carried_by
+                self.moved.append((away, body.name))
+        else:
+            carrier = compose(self.poses[b], inverse(body.pose))
+        if carrier is not None:
+            self.carriers[b] = carrier
         moves = columns(joint, frame, q)
-        centre = poses[b][:3] + rotate(poses[b][3:], com[b])
-        asked = np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
-        if b >= given:
-            asked = twists[whole[b]]
-        v = np.linalg.lstsq(moves, asked - twists[joint.parent], rcond=None)[0] if any(asked) else np.zeros(moves.shape[1])
+        twist = self.twists[self.whole[b]] if part else self._asked_twist(b, self.poses[b])
+        v = np.zeros(moves.shape[1])
+        if part or body.velocity.any() or body.angular_velocity.any():
+            v = np.linalg.lstsq(moves, twist - self.twists[joint.parent], rcond=None)[0]
         if joint.start_velocity is not None:
             v = np.where(np.isnan(joint.start_velocity), v, joint.start_velocity)
-        twists[b] = twists[joint.parent] + moves @ v
-        q0.append(q)
-        v0.append(v)
-        axis = directions(joint)
-        axes.append(moves)
+        self.twists[b] = self.twists[joint.parent] + moves @ v
+        self.q0.append(q)
+        self.v0.append(v)
+        self.axes.append(moves)
         if joint.acceleration is not None:
-            by_inertia += (len(dofs) + np.flatnonzero(joint.acceleration)).tolist()
-        joint_names[b], dof_names = joint.name, [*dof_names, *(joint.names or [joint.name] * len(axis))]
+            self.by_inertia += (len(self.dofs) + np.flatnonzero(joint.acceleration)).tolist()
+        along = directions(joint)
+        self.joint_names[b], self.dof_names = joint.name, [*self.dof_names, *(joint.names or [joint.name] * len(along))]
         numbers = (joint.armature, joint.damping, joint.friction, joint.limit, joint.drive)
-        dofs += list(zip([b] * len(axis), kinds(joint), axis, *numbers, strict=True))
-    columns_of = list(zip(*dofs, strict=True))
-    drive = np.array(columns_of[7], dtype=float).reshape(-1, 5)
-    if by_inertia:
-        owner, armature = np.array(columns_of[0]), np.array(columns_of[3], dtype=float)
-        # What carries a part of a body sees all of it.
-        matrix = mass_matrix(parents, order, owner, np.concatenate(axes, axis=1), poses, entire[0], com, entire[1])
-        matrix[np.diag_indices(len(owner))] += armature
-        drive[by_inertia, :2] /= np.linalg.inv(matrix)[by_inertia, by_inertia, None]
-    if moved:
-        far, worst = max(moved)
-        what = f"{len(moved)} bodies do" if len(moved) > 1 else f"{worst} does"
-        which = f", {worst} by {far:.3g} m" if len(moved) > 1 else f" by {far:.3g} m"
-        notes.insert(0, f"{what} not stand where joints let them: moved there{which}")
-    return {
-        "body_names": tuple(b.name for b in bodies),
-        "part_of": np.array([b if body.part_of is None else body.part_of for b, body in enumerate(bodies)], dtype=np.int32),
-        "mass": mass,
-        "com": com,
-        "inertia": inertia,
-        "body_parent": parents,
-        "joint_names": tuple(joint_names),
-        "dof_names": tuple(dof_names),
-        "joint_type": np.array(types, dtype=np.int32),
-        "joint_pose": frames,
-        "joint_child_pose": child_frames,
-        **starts,
-        "q0": np.concatenate(q0),
-        "v0": np.concatenate(v0),
-        "dof_body": np.array(columns_of[0], dtype=np.int32),
-        "dof_kind": np.array(columns_of[1], dtype=np.int32),
-        "dof_axis": np.array(columns_of[2], dtype=float),
-        "armature": np.array(columns_of[3], dtype=float),
-        "damping": np.array(columns_of[4], dtype=float),
-        "joint_friction": np.array(columns_of[5], dtype=float),
-        "limit": np.array(columns_of[6], dtype=float).reshape(-1, 2),
-        "drive": drive,
-        "loops": tuple(loop_of(joint) for joint in loops),
-    }, notes
+        self.dofs += list(zip([b] * len(along), kinds(joint), along, *numbers, strict=True))
+
+    @property
+    def notes(self) -> list[str]:
+        """What is to be told of it."""
+        found = []
+        if self.moved:
+            far, worst = max(self.moved)
+            what = f"{len(self.moved)} bodies do" if len(self.moved) > 1 else f"{worst} does"
+            which = f", {worst} by {far:.3g} m" if len(self.moved) > 1 else f" by {far:.3g} m"
+            found.append(f"{what} not stand where joints let them: moved there{which}")
+        for b in range(self.given, len(self.bodies)):
+            name, of = self.bodies[b].name.removesuffix(":carried"), self.bodies[self.whole[b]].name
+            found.append(f"{name}: closes a loop and has limits, drives or the like: it carries a part of {of} that is welded to the rest")
+        lost = [joint.name for joint in self.loops if joint.distance is None and acts(joint)]
+        return found + [f"{name}: closes a loop between bodies without mass: its limits, drives and the like are left out" for name in lost]
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """Of :class:`Model`."""
+        owner, kind, axis, armature, damping, friction, limit, drive = (list(column) for column in zip(*self.dofs, strict=True))
+        return {
+            "body_names": tuple(b.name for b in self.bodies),
+            "part_of": np.array([b if body.part_of is None else body.part_of for b, body in enumerate(self.bodies)], dtype=np.int32),
+            "mass": self.share * self.mass,
+            "com": self.com,
+            "inertia": self.share[:, None, None] * self.inertia,
+            "body_parent": self.parents,
+            "joint_names": tuple(self.joint_names),
+            "dof_names": tuple(self.dof_names),
+            "joint_type": np.array(self.types, dtype=np.int32),
+            "joint_pose": self.frames,
+            "joint_child_pose": self.child_frames,
+            "q_start": self.q_start,
+            "v_start": self.v_start,
+            "q0": np.concatenate(self.q0),
+            "v0": np.concatenate(self.v0),
+            "dof_body": np.array(owner, dtype=np.int32),
+            "dof_kind": np.array(kind, dtype=np.int32),
+            "dof_axis": np.array(axis, dtype=float),
+            "armature": np.array(armature, dtype=float),
+            "damping": np.array(damping, dtype=float),
+            "joint_friction": np.array(friction, dtype=float),
+            "limit": np.array(limit, dtype=float).reshape(-1, 2),
+            "drive": self._forces(np.array(owner), np.array(armature, dtype=float), np.array(drive, dtype=float).reshape(-1, 5)),
+            "loops": tuple(loop_of(joint) for joint in self.loops),
+        }
+
+    def _forces(self, owner: np.ndarray, armature: np.ndarray, drive: np.ndarray) -> np.ndarray:
+        """Drives [nv, 5] with the gains of those that ask for accelerations times the inertia that their joints see here."""
+        if self.by_inertia:
+            axes = np.concatenate(self.axes, axis=1)
+            matrix = mass_matrix(self.parents, self.order, owner, axes, self.poses, self.mass, self.com, self.inertia)
+            matrix[np.diag_indices(len(owner))] += armature
+            drive[self.by_inertia, :2] /= np.linalg.inv(matrix)[self.by_inertia, self.by_inertia, None]
+        return drive
