@@ -173,15 +173,100 @@ def test_stacked_axes_may_close_a_loop():
     assert paths[0] == pytest.approx(paths[1], abs=2.0 * h)
 
 
-def test_a_loop_between_bodies_without_mass_is_told():
-    """What carries one of two axes has no mass, so that no part of it can be carried."""
+def bars(*masses: float | None) -> tuple[wl.ModelBuilder, dict[int, np.ndarray]]:
+    """Bodies in a row, a metre apart, of these masses; None: nothing says, a joint holds it. And where they are."""
     builder = wl.ModelBuilder()
-    a, b = (builder.add_body(name, mass=0.0) for name in "ab")
-    end = builder.add_body("end", mass=1.0, inertia=np.eye(3))
-    for parent, child, axis in ((-1, a, "x"), (a, b, "y"), (b, end, "z")):
-        hinge(builder, parent, child, np.zeros(3), axis, {})
-    hinge(builder, a, b, np.zeros(3), "y", {}, loop=True, limit=(-1.0, 1.0), name="lost")
-    assert any(note.startswith("lost: closes a loop between bodies without mass") for note in builder.finalize().report.notes)
+    for k, mass in enumerate(masses):
+        builder.add_body(f"b{k}", pose=(k, 0, 0, 0, 0, 0, 1), mass=mass, inertia=np.eye(3) if mass else None)
+    return builder, {k: np.array([k, 0.0, 0.0]) for k in range(len(masses))}
+
+
+def closed(builder: wl.ModelBuilder, place: dict[int, np.ndarray], ends: list[tuple[int, int]], weld: int, **options) -> wl.Model:
+    """Finalized, with a hinge half-way between each two bodies but for one weld; `options` act along the hinges."""
+    for k, (a, b) in enumerate(ends):
+        at = 0.5 * (place.get(a, np.array([-1.0, 0, 0])) + place.get(b, np.array([len(place), 0.0, 0])))
+        if k == weld:
+            frames = [(*(at - place[body]), 0, 0, 0, 1) for body in (a, b)]
+            builder.add_joint(JointType.FIXED, a, b, parent_frame=frames[0], child_frame=frames[1])
+        else:
+            hinge(builder, a, b, at, "y", place, name=f"h{k}", **options)
+    return builder.finalize()
+
+
+def test_welds_carry_before_hinges_along_which_something_acts():
+    """A frame without mass that is welded to a bar: cut at the weld it would hang on a hinge that nothing makes inert."""
+    model = closed(*bars(2.0, None, 1.0), [(-1, 0), (0, 1), (1, 2), (2, -1)], weld=1, limit=(-1.0, 1.0))
+    assert model.body_parent.tolist() == [-1, 0, -1, 1]
+    sim = simulator(model)
+    sim.step(10)
+    assert not sim.status.numpy().any()
+
+
+def test_what_is_welded_to_the_world_stays_there():
+    """A damped hinge between two bodies that the world holds neither moves nor parts them."""
+    builder, place = bars(1.0, 1.0, 1.0)
+    for body in (0, 1):
+        builder.add_joint(JointType.FIXED, -1, body, parent_frame=(*place[body], 0, 0, 0, 1))
+    hinge(builder, 0, 1, np.array([0.5, 0, 0]), "y", place, damping=0.1, name="idle")
+    model = builder.finalize()
+    assert model.movable.tolist() == [False, False, True, False]
+    assert model.num_bodies == 3
+    assert any(note.startswith("idle: closes a loop between bodies that forces do not move") for note in model.report.notes)
+
+
+def test_a_body_without_mass_carries_on():
+    """Between two hinges that meet in it, one plain, all others damped: both carry, and another one is cut."""
+    builder, place = bars(1.0, 0.0, 1.0, 1.0)
+    for k, (a, b) in enumerate([(-1, 0), (0, 1), (1, 2), (2, 3), (3, -1)]):
+        at = 0.5 * (place.get(a, np.array([-1.0, 0, 0])) + place.get(b, np.array([4.0, 0, 0])))
+        hinge(builder, a, b, at, "xyzyx"[k], place, damping=0.0 if k == 2 else 0.1, name=f"h{k}")
+    model = builder.finalize()
+    assert model.body_parent[[1, 2]].tolist() == [0, 1]
+    assert [loop.name for loop in model.loops] == ["h3:weld"]
+
+
+def test_a_joint_that_carries_nothing_with_mass():
+    builder, place = bars(1.0, 0.0, 0.0)
+    for a, b in ((-1, 0), (0, 1), (1, 2)):
+        hinge(builder, a, b, np.zeros(3), "y", place)
+    builder.add_joint(JointType.SPHERICAL, 2, 0, loop=True)
+    with pytest.raises(wl.WarpLcpError, match="mass"):
+        builder.finalize()
+
+
+def test_two_joints_may_part_one_body():
+    """In equal shares, whatever the number; and what asks for accelerations sees all of the body."""
+    drive = Drive(10.0, 1.0, acceleration=True)
+    plain, parted = bars(1.0, 2.0), bars(1.0, 2.0)
+    for builder, place in (plain, parted):
+        hinge(builder, -1, 0, np.array([-0.5, 0, 0]), "y", place)
+        hinge(builder, 0, 1, np.array([0.5, 0, 0]), "y", place, drive=drive)
+    for name in "ab":
+        hinge(*(parted[0], 0, 1, np.array([0.5, 0, 0]), "y", parted[1]), damping=0.1, loop=True, name=name)
+    model = parted[0].finalize()
+    assert model.mass == pytest.approx([1.0, 2 / 3, 2 / 3, 2 / 3])
+    assert model.part_of.tolist() == [0, 1, 1, 1]
+    assert model.drive[1] == pytest.approx(plain[0].finalize().drive[1])
+
+
+@pytest.mark.parametrize("loop", [False, True])
+def test_angles_start_within_their_limits(loop):
+    """Where a body stands tells an angle but for whole turns: of 3.2 and 3.2 - 2 pi the one that the limit allows. Nothing moves then."""
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    turn = np.array([0, np.sin(1.6), 0, np.cos(1.6)])
+    body = builder.add_body(pose=(0, 0, 0, *turn), mass=1.0, inertia=np.eye(3))
+    builder.add_joint(JointType.D6, -1, body, axes=("ry",))
+    if loop:
+        builder.add_joint(JointType.D6, -1, body, axes=("ry",), limit=(2.9, 3.5), start=3.0, start_velocity=5.0, loop=True)
+    else:
+        builder = wl.ModelBuilder(gravity=(0, 0, 0))
+        body = builder.add_body(pose=(0, 0, 0, *turn), mass=1.0, inertia=np.eye(3))
+        builder.add_joint(JointType.D6, -1, body, axes=("ry",), limit=(2.9, 3.5))
+    model = builder.finalize()
+    assert model.q0[-1] == pytest.approx(3.2)
+    sim = simulator(model)
+    sim.step(10)
+    assert np.abs(sim.v.numpy()).max() < 1e-9
 
 
 # --------------------------------------------------------------------------------------------------------------------- USD
@@ -197,7 +282,7 @@ def loop_stage() -> list[str]:
 def test_excluded_joint_with_a_limit():
     """Both turn about the same axis: the limit of the one that closes the loop holds the other."""
     model = load(*loop_stage())
-    assert model.body_names == ("/A", "/B", "/K:carried")
+    assert model.body_names == ("/A", "/B", "/K:part")
     assert np.degrees(model.limit[-1]) == pytest.approx([-180, 10])
     sim = simulator(model, dt=2e-3)
     sim.v.assign(np.r_[np.zeros(6), 1.0, 1.0][None])

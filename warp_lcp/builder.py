@@ -188,7 +188,8 @@ class ModelBuilder:
             start: coordinates at the start, as in q; omitted or NaN: those nearest to where the bodies stand. What hangs on the child is
                 carried along.
             start_velocity: of each coordinate; omitted or NaN: what the velocities of the bodies leave for it.
-            loop: never carry the child by this joint, hold both bodies where they are.
+            loop: do not carry the child by this joint, hold both bodies where they are. What has limits, a drive or the like carries a
+                part of the child that is welded to the rest (`Model.part_of`).
             collide: let the shapes of the two bodies touch, and those of what hangs rigidly on them.
             name: 'joint<i>' if omitted. axis_names: of each coordinate; the joint's if omitted.
 

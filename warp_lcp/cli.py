@@ -167,7 +167,7 @@ def _model_facts(model: Model, law: Law) -> dict[str, Any]:
     from .model import DofKind, JointType, ShapeType
 
     bodies, shapes = [], []
-    own = np.bincount(model.dof_body[model.dof_kind != DofKind.PRESCRIBED], minlength=model.num_bodies)
+    own = np.bincount(model.part_of[model.dof_body[model.dof_kind != DofKind.PRESCRIBED]], minlength=model.num_bodies)
     mass = np.bincount(model.part_of, model.mass, model.num_bodies)
     for b in model.scene_bodies:
         joint = JointType(model.joint_type[b]).name.lower()

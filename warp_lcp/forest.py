@@ -33,73 +33,100 @@ class Body:
     part_of: int | None = None
 
 
-def spanning(types: list[JointType], joints: list[Joint]) -> tuple[list[Joint | None], list[Joint]]:
+def spanning(bodies: list[Body], joints: list[Joint], mass: np.ndarray) -> tuple[list[Joint | None], list[Joint]]:
     """Joint that carries each body (None: free, kinematic or fixed), and joints that close loops.
 
     Bodies that are joined to the world, or to a body that forces do not move, hang there; of others the first one is free and carries
-    the rest. Joints along which something acts carry before those that only hold, so that loops are cut at the latter where they have
-    some; among alike breadth first, so that they are cut far from the root.
+    the rest. Which joints carry, so that loops are cut at others: first those that let nothing move, then those of bodies that have no
+    ``mass`` [B] and must be carried and carry, then those along which something acts. Among alike breadth first, so that loops are cut far
+    from the root.
     """
-    neighbours: dict[int, list[tuple[Joint, int]]] = {b: [] for b in range(-1, len(types))}
+    neighbours: dict[int, list[tuple[Joint, int]]] = {b: [] for b in range(-1, len(bodies))}
     for joint in (joint for joint in joints if not joint.loop):
         neighbours[joint.parent].append((joint, joint.child))
         neighbours[joint.child].append((joint, joint.parent))
+    held = {b for joint in joints if joint.type is JointType.FIXED and not joint.loop for b in (joint.parent, joint.child)}
+    between = {b for b in range(len(bodies)) if mass[b] == 0.0 and bodies[b].joint is JointType.FREE} - held
     carried: dict[int, Joint | None] = {-1: None}
     used: set[int] = set()
-    ahead: tuple[list[tuple[Joint, int]], ...] = ([], [])  # joints along which something acts, and others, with where they lead
+    ahead: list[list[tuple[Joint, int]]] = [[], [], [], []]  # joints with where they lead, by rank
+
+    def rank(joint: Joint) -> int:
+        return 0 if joint.type is JointType.FIXED else 1 if {joint.parent, joint.child} & between else 2 if acts(joint) else 3
 
     def reach(b: int) -> None:
         for joint, other in neighbours[b]:
-            ahead[not acts(joint)].append((joint, other))
+            ahead[rank(joint)].append((joint, other))
 
     def spread(roots: list[int]) -> None:
         for b in roots:
             reach(b)
-        while any(ahead):
-            joint, other = (ahead[0] or ahead[1]).pop(0)
+        while queue := next((queue for queue in ahead if queue), None):
+            joint, other = queue.pop(0)
             if other not in carried:
                 carried[other] = joint if joint.child == other else turned(joint)
                 used.add(id(joint))
                 reach(other)
 
-    still = [b for b, kind in enumerate(types) if kind is not JointType.FREE]
+    still = [b for b, body in enumerate(bodies) if body.joint is not JointType.FREE]
     for b in still:
         carried[b] = None
     spread([-1, *still])
-    for b in range(len(types)):
+    for b in range(len(bodies)):
         if b not in carried:
             carried[b] = None
             spread([b])
-    return [carried[b] for b in range(len(types))], [joint for joint in joints if id(joint) not in used]
+    return [carried[b] for b in range(len(bodies))], [joint for joint in joints if id(joint) not in used]
 
 
 def cut(bodies: list[Body], joints: list[Joint], mass: np.ndarray) -> tuple[list[Body], list[Joint]]:
     """Bodies and joints in which whatever acts along a joint acts along a coordinate, also where the joint closes a loop.
 
-    A constraint has no coordinate that could be limited, driven or damped. Such a joint carries a half of its child instead (of its
-    parent, where the child is not free or has no ``mass``), and the half is welded to the whole, which closes the loop. So do joints of
-    stacked axes. The halves stand behind all other bodies.
+    A constraint has no coordinate that could be limited, driven or damped. Such a joint carries a part of its child instead (of its
+    parent, where forces do not move the child or it has no ``mass``), and the part is welded to the rest, which closes the loop. So do
+    joints of stacked axes. The parts stand behind all other bodies, each with an equal share of the mass.
     """
+    carried, loops = spanning(bodies, joints, mass)
+    moves = {-1: False}
+    for b in parents_first([-1 if joint is None else joint.parent for joint in carried]):
+        joint = carried[b]
+        moves[b] = bodies[b].joint is JointType.FREE if joint is None else joint.type is not JointType.FIXED or moves[joint.parent]
     bodies, joints = list(bodies), list(joints)
-    for joint in spanning([b.joint for b in bodies], joints)[1]:
-        solid = [b for b in (joint.child, joint.parent) if b >= 0 and bodies[b].joint is JointType.FREE and mass[b] > 0.0]
+    for joint in loops:
+        solid = [b for b in (joint.child, joint.parent) if moves[b] and mass[b] > 0.0]
         if joint.distance is not None or not solid or not (acts(joint) or joint.directions is not None):
             continue
-        whole, half = solid[0], len(bodies)
-        bodies.append(replace(bodies[whole], name=f"{joint.name}:carried", part_of=whole))
+        whole, part = solid[0], len(bodies)
+        bodies.append(replace(bodies[whole], name=f"{joint.name}:part", part_of=whole))
         at = next(k for k, other in enumerate(joints) if other is joint)
-        parent, child = (joint.parent, half) if whole == joint.child else (half, joint.child)
+        parent, child = (joint.parent, part) if whole == joint.child else (part, joint.child)
         joints[at] = replace(joint, loop=False, parent=parent, child=child)
         still, nothing = np.array(IDENTITY), np.zeros(0)
         along = (nothing, nothing, nothing, np.zeros((0, 2)), np.zeros((0, 5)))
-        joints.append(Joint(f"{joint.name}:weld", JointType.FIXED, whole, half, still, still, (), *along, loop=True))
+        joints.append(Joint(f"{joint.name}:weld", JointType.FIXED, whole, part, still, still, (), *along, loop=True))
     return bodies, joints
+
+
+def start_of(joint: Joint, q: np.ndarray, free: bool) -> np.ndarray:
+    """Coordinates at the start: the joint's own where it has some and is ``free`` to choose them, else q, which its bodies ask for.
+
+    Bodies tell angles but for whole turns: what the joint's own are nearest to or, without any, what its limits allow.
+    """
+    start = np.full(len(q), np.nan) if joint.start is None else joint.start
+    if joint.type is not JointType.SPHERICAL:
+        angles = np.array([kind is DofKind.ANGULAR for kind in kinds(joint)], dtype=bool)
+        turns = np.where(np.isnan(start), 0.0, np.round((start - q) / (2.0 * np.pi)))
+        for k in np.flatnonzero(angles & np.isnan(start)):
+            low, high = joint.limit[k]
+            turns[k] = next((n for n in (0, 1, -1) if low <= q[k] + 2.0 * np.pi * n <= high), 0)
+        q = q + 2.0 * np.pi * angles * turns
+    return np.where(np.isnan(start), q, start) if free else q
 
 
 def loop_of(joint: Joint) -> Loop:
     """The same joint as a constraint."""
     if joint.directions is not None:
-        raise ModelError(f"{joint.name}: a joint of stacked axes cannot close a loop between bodies without mass; give one of them some")
+        raise ModelError(f"{joint.name}: a joint of stacked axes closes a loop, and no body beside it has mass and is moved by forces")
     x, y, z, rx, ry, rz = (axis not in joint.axes for axis in AXES)
     frames = np.array([joint.parent_frame, joint.child_frame])
     return Loop(joint.name, (joint.parent, joint.child), frames, (x, y, z), (rx, ry, rz), joint.distance)
@@ -121,12 +148,13 @@ class Arrangement:
         self.given = len(bodies)
         self.bodies, joints = cut(bodies, joints, mass)
         count = len(self.bodies)
-        self.carried, self.loops = spanning([b.joint for b in self.bodies], joints)
+        mass = np.r_[mass, [mass[b.part_of] for b in self.bodies[self.given :]]]
+        self.carried, self.loops = spanning(self.bodies, joints, mass)
         self.order = parents_first([-1 if joint is None else joint.parent for joint in self.carried])
-        self._check_masses(shaped)
+        self._check_masses(shaped, mass)
         self.whole = np.array([b if b < self.given else body.part_of for b, body in enumerate(self.bodies)])
         self.share = 1.0 / np.bincount(self.whole)[self.whole]
-        self.mass, self.com, self.inertia = mass[self.whole], com[self.whole], inertia[self.whole]  # a part has those of all of it here
+        self.mass, self.com, self.inertia = mass, com[self.whole], inertia[self.whole]  # a part has those of all of it here
         self.types, self.parents = [b.joint for b in self.bodies], np.full(count, -1, dtype=np.int32)
         self.frames, self.child_frames = np.tile(IDENTITY, (count, 1)), np.tile(IDENTITY, (count, 1))
         self.poses = np.array([b.pose for b in self.bodies])
@@ -148,12 +176,20 @@ class Arrangement:
             else:
                 self._hang(b, joint)
 
-    def _check_masses(self, shaped: Collection[int]) -> None:
+    def _check_masses(self, shaped: Collection[int], mass: np.ndarray) -> None:
         carries = {joint.parent for joint in self.carried if joint is not None}
+        hanging = mass.copy()  # what hangs on a body, itself included
+        for b in self.order[::-1]:
+            joint = self.carried[b]
+            if joint is not None and joint.parent >= 0:
+                hanging[joint.parent] += hanging[b]
         for b, body in enumerate(self.bodies):
-            if body.mass == 0.0 and (self.carried[b] is None or b not in carries or b in shaped):
+            joint = self.carried[b]
+            if body.mass == 0.0 and (joint is None or b not in carries or b in shaped):
                 why = "only what hangs on a joint, carries another body and has no shape may have none"
                 raise ModelError(f"{body.name}: mass is 0 kg; {why}")
+            if joint is not None and joint.axes and hanging[b] == 0.0 and not joint.armature.all():
+                raise ModelError(f"{joint.name}: nothing that it carries has mass; give {body.name} some, or the joint an armature")
 
     def _stand(self, b: int) -> None:
         """A body that no joint carries: free, kinematic or fixed."""
@@ -188,12 +224,10 @@ class Arrangement:
         # What a joint with a given coordinate carries stands as if carried there; a part of a body where the rest of it is.
         carrier = self.carriers.get(joint.parent)
         asked = self.poses[self.whole[b]] if part else body.pose if carrier is None else compose(carrier, body.pose)
-        q = coordinates(joint, compose(inverse(frame), compose(asked, joint.child_frame)))
-        if joint.start is not None:
-            q = np.where(np.isnan(joint.start), q, joint.start)
+        q = start_of(joint, coordinates(joint, compose(inverse(frame), compose(asked, joint.child_frame))), not part)
         placed = compose(frame, pose_of(joint, q))
         self.poses[b] = compose(placed, inverse(joint.child_frame))
-        if joint.start is None:  # the child's frame is the joint's: what turns there does not count as moved
+        if joint.start is None or part:  # the child's frame is the joint's: what turns there does not count as moved
             away = float(np.linalg.norm(placed[:3] - compose(asked, joint.child_frame)[:3]))
             if away > MOVED:
                 self.moved.append((away, body.name))
@@ -206,7 +240,7 @@ class Arrangement:
         v = np.zeros(moves.shape[1])
         if part or body.velocity.any() or body.angular_velocity.any():
             v = np.linalg.lstsq(moves, twist - self.twists[joint.parent], rcond=None)[0]
-        if joint.start_velocity is not None:
+        if joint.start_velocity is not None and not part:
             v = np.where(np.isnan(joint.start_velocity), v, joint.start_velocity)
         self.twists[b] = self.twists[joint.parent] + moves @ v
         self.q0.append(q)
@@ -228,11 +262,12 @@ class Arrangement:
             what = f"{len(self.moved)} bodies do" if len(self.moved) > 1 else f"{worst} does"
             which = f", {worst} by {far:.3g} m" if len(self.moved) > 1 else f" by {far:.3g} m"
             found.append(f"{what} not stand where joints let them: moved there{which}")
-        for b in range(self.given, len(self.bodies)):
-            name, of = self.bodies[b].name.removesuffix(":carried"), self.bodies[self.whole[b]].name
-            found.append(f"{name}: closes a loop and has limits, drives or the like: it carries a part of {of} that is welded to the rest")
+        for body in self.bodies[self.given :]:
+            name, of = body.name.removesuffix(":part"), self.bodies[body.part_of or 0].name
+            found.append(f"{name}: closes a loop, and something acts along it: it carries a part of {of} that is welded to the rest")
         lost = [joint.name for joint in self.loops if joint.distance is None and acts(joint)]
-        return found + [f"{name}: closes a loop between bodies without mass: its limits, drives and the like are left out" for name in lost]
+        why = "closes a loop between bodies that forces do not move, or without mass: its limits, drives and the like are left out"
+        return found + [f"{name}: {why}" for name in lost]
 
     @property
     def fields(self) -> dict[str, Any]:
@@ -266,10 +301,15 @@ class Arrangement:
         }
 
     def _forces(self, owner: np.ndarray, armature: np.ndarray, drive: np.ndarray) -> np.ndarray:
-        """Drives [nv, 5] with the gains of those that ask for accelerations times the inertia that their joints see here."""
-        if self.by_inertia:
-            axes = np.concatenate(self.axes, axis=1)
-            matrix = mass_matrix(self.parents, self.order, owner, axes, self.poses, self.mass, self.com, self.inertia)
-            matrix[np.diag_indices(len(owner))] += armature
-            drive[self.by_inertia, :2] /= np.linalg.inv(matrix)[self.by_inertia, self.by_inertia, None]
+        """Drives [nv, 5] with the gains of those that ask for accelerations times the inertia that their joints see here.
+
+        A body that is parted is whole for each: where it hangs itself, or where its part does.
+        """
+        axes = np.concatenate(self.axes, axis=1)
+        for i in self.by_inertia:
+            here = (np.arange(len(self.bodies)) < self.given) | (np.arange(len(self.bodies)) == owner[i])
+            masses = (here * self.mass, self.com, here[:, None, None] * self.inertia)
+            matrix = mass_matrix(self.parents, self.order, owner, axes, self.poses, *masses)
+            matrix[np.diag_indices(len(owner))] += armature + (np.diag(matrix) == 0.0)
+            drive[i, :2] /= np.linalg.inv(matrix)[i, i]
         return drive

@@ -6,7 +6,7 @@ Decisions where USD leaves room:
 - A limit whose lower bound is above its upper one locks its axis, as the schema says of D6 joints.
 - Bodies that do not stand where a joint lets them are moved there when the scene starts; how far is noted. So are they, and all they
   carry, to where ``state:<axis>:physics:position`` says (PhysicsJointStateAPI; its velocity is read too).
-- Joints with physics:excludeFromArticulation close loops. Of others that do, those that are furthest from the root.
+- Joints with physics:excludeFromArticulation close loops. Of others that do, those along which nothing acts, furthest from the root.
 - Joints between the same two bodies each take away from what is free, unless ``newton:jointsAddMobility`` on their articulation root
   says that each adds to it, as several joints of one body do in MuJoCo: then they act one after the other in stage order, the first on
   the first body, each as moved by those before it. Where their axes of rotation do not meet in a point, bodies without mass stand between.
