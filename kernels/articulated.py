@@ -30,7 +30,7 @@ STIFF = wp.constant(0.01)
 UNRESOLVED = wp.constant(1.0)
 CALM = wp.constant(0.1)
 # What rows changed a step ago they are expected to change again, unless it was more than this part of the largest velocity and more than
-# this many times what all else changed: it was a hit.
+# this many times what v_free was beyond what was expected: it was a hit.
 LASTING = wp.constant(0.25)
 HIT = wp.constant(2.0)
 # Where a step does not resolve c, M_ii is this part larger for joints, which takes a third of their velocity.

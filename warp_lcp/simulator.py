@@ -293,7 +293,8 @@ class Simulator:
         force of the drives). SI units.
 
         What follows from a parameter follows at once: inverse masses, the scaling of Table 1, the coefficients of a
-        pair. ``mass`` without ``inertia`` is a body of the same shape and another density: its inertia scales along.
+        pair. ``mass`` without ``inertia`` is a body of the same shape and another density: its inertia scales along. What is a part of a
+        body (``Model.part_of``) has a mass, centre and inertia of its own: the body has the sum.
         Where no pair of the model bounces, the first that does loads the kernels that it needs.
 
         Raises:
