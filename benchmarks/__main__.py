@@ -264,8 +264,7 @@ def run_chart(asked: argparse.Namespace) -> None:
         if any(row.get("path") for row in rows):
             drawn += chart_picture.draw_box(rows, folder / "chart_box")
         print(f"\ndrawn: {', '.join(str(file) for file in drawn)}")
-        if (folder / "chart.md").exists():
-            report.document("chart", chart.markdown(rows), folder / "chart.md")
+        report.document("chart", chart.markdown(rows), folder / "chart.md")
 
 
 def compared(names: list[str], quick: bool, folder: Path) -> dict[str, Any]:

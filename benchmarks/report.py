@@ -63,11 +63,14 @@ def begin(what: str) -> str:
 
 
 def document(what: str, text: str, path: Path) -> None:
-    """Put the tables of a command between their marks in a document.
+    """Put the tables of a command between their marks in a document; where there is none, they are one.
 
     Raises:
         ValueError: if it has no marks.
     """
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{begin(what)}\n{END}\n")
     before, mark, rest = path.read_text().partition(begin(what))
     _, end, after = rest.partition(END)
     if not (mark and end):

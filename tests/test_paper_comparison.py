@@ -109,6 +109,8 @@ def test_tables_go_between_their_marks(tmp_path):
     path.write_text("no marks\n")
     with pytest.raises(ValueError, match="marks"):
         report.document("paper", "new", path)
+    report.document("paper", "new", tmp_path / "nowhere" / "paper.md")  # a whole run must not end for want of a document
+    assert report.tables("paper", tmp_path / "nowhere" / "paper.md") == "new"
 
 
 def results():
