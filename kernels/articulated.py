@@ -29,99 +29,19 @@ STIFF = wp.constant(0.01)
 # ... and where it is more than this part, the velocity is damped by this part of h times the stiffness.
 UNRESOLVED = wp.constant(1.0)
 CALM = wp.constant(0.1)
-# What rows changed a step ago they are expected to change again, unless it was more than this part of the largest velocity and more than
-# this many times what v_free was beyond what was expected: it was a hit.
-LASTING = wp.constant(0.25)
-HIT = wp.constant(2.0)
 # Where a step does not resolve c, M_ii is this part larger for joints, which takes a third of their velocity.
 SLOWED = wp.constant(0.5)
 
 
 @functools.cache
-def make(real) -> SimpleNamespace:
-    """Kernels of scenes with joints; ``dynamics`` of any scene. Launch with dim (E)."""
+def functions(real) -> SimpleNamespace:
+    """What a step needs of M(q) and c(q, v): ``inertias``, ``factorise``, ``forces``, ``impulses``, ``matters``."""
     t = scalar_types(real)
-    vec3, mat33, quat, transform, spatial = t.vec3, t.mat33, t.quat, t.transform, t.spatial
+    vec3, mat33, spatial = t.vec3, t.mat33, t.spatial
     Bodies, Parameters, Topology = t.Bodies, t.Parameters, t.Topology
     f = tree.functions(real)
-    Trees, pair, moved_by, propagate = f.Trees, f.pair, f.moved_by, f.propagate
-    added, inertia_along = f.added, f.inertia_along
+    Trees, pair, moved_by, added = f.Trees, f.pair, f.moved_by, f.added
     mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
-    advance = tree.motion(real)
-    rounding = real(1.0e-16) if real is wp.float64 else real(1.0e-7)
-    settled = real(1.0e-9) if real is wp.float64 else real(1.0e-6)
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def kinematics(
-        q: wp.array2d(dtype=real),
-        v: wp.array2d(dtype=real),
-        topology: Topology,
-        parameters: Parameters,
-        trees: Trees,
-        bodies: Bodies,
-        stride: int,
-    ):
-        """Poses, axes and velocities, from the roots to the leaves."""
-        start, _ = wp.tid()
-        for env in range(start, q.shape[0], stride):
-            for k_b in range(trees.order.shape[0]):
-                b = trees.order[k_b]
-                parent = trees.parent[b]
-                kind = topology.joint_type[b]
-                i_q = topology.q_start[b]
-                com = parameters.com[env % parameters.com.shape[0], b]
-                pose = topology.joint_pose[b]
-                twist = spatial()
-                origin = vec3()
-                if kind == FREE_JOINT or kind == KINEMATIC:  # noqa: SIM109
-                    for k in range(7):
-                        pose[k] = q[env, i_q + k]
-                    # Users write q: a quaternion that is not of unit length would scale the body. Zero gives NaN, which is flagged.
-                    pose = transform(wp.transform_get_translation(pose), wp.normalize(wp.transform_get_rotation(pose)))
-                    origin = wp.transform_point(pose, com)
-                    trees.origin[env, b] = origin
-                    for k in range(3):
-                        i = trees.first[b] + k
-                        axis = vec3()
-                        axis[k] = real(1.0)
-                        trees.screw[env, i] = pair(axis, vec3())
-                        trees.screw[env, i + 3] = pair(vec3(), axis)
-                        twist[k] = v[env, i]
-                        twist[3 + k] = v[env, i + 3]
-                else:
-                    if parent >= 0:
-                        pose = bodies.pose[env, parent] * pose
-                        twist = trees.twist[env, parent]
-                    x = wp.transform_get_translation(pose)
-                    turn = wp.transform_get_rotation(pose)
-                    if trees.root[b] == b:
-                        trees.origin[env, b] = x
-                    origin = trees.origin[env, trees.root[b]]
-                    for i in range(trees.first[b], trees.end[b]):
-                        linear = vec3()
-                        angular = vec3()
-                        if trees.kind[i] == LINEAR:
-                            linear = wp.quat_rotate(turn, trees.axis[i])
-                            x += q[env, i_q] * linear
-                            i_q += 1
-                        else:
-                            if trees.kind[i] == ANGULAR:
-                                turn = turn * wp.quat_from_axis_angle(trees.axis[i], q[env, i_q])
-                                i_q += 1
-                            elif trees.kind[i] == BALL:
-                                turn = turn * wp.normalize(quat(q[env, i_q], q[env, i_q + 1], q[env, i_q + 2], q[env, i_q + 3]))
-                                i_q += 4
-                            angular = wp.quat_rotate(turn, trees.axis[i])
-                            linear = wp.cross(x - origin, angular)
-                        screw = pair(linear, angular)
-                        trees.screw[env, i] = screw
-                        twist += v[env, i] * screw
-                    pose = transform(x, turn) * trees.child_pose[b]
-                bodies.pose[env, b] = pose
-                trees.twist[env, b] = twist
-                centre = wp.transform_point(pose, com)
-                bodies.com[env, b] = centre
-                bodies.velocity[env, b] = pair(moved_by(twist, centre - origin), wp.spatial_bottom(twist))
 
     @wp.func
     def cross_motion(twist: spatial, s: spatial) -> spatial:
@@ -140,11 +60,13 @@ def make(real) -> SimpleNamespace:
         part: real,
         h: real,
         bodies: Bodies,
+        bent: wp.array2d(dtype=spatial),
         env: int,
     ):
         """trees.push := what gravity, wrenches and inertia give to each body within h [N s, N m s about O].
 
-        At v + trees.change / 2, or at rest (part = 1, 0); their twists are trees.twist and trees.gained.
+        `bent` := what the paths that joints leave to a body take of its momentum within h, which is the part of inertia [N s, N m s about
+        its centre of mass]. At v + trees.change / 2, or at rest (part = 1, 0); their twists are trees.twist and trees.gained.
         """
         gravity = parameters.gravity[env % parameters.gravity.shape[0]]
         for k in range(trees.order.shape[0]):
@@ -175,10 +97,13 @@ def make(real) -> SimpleNamespace:
             r = bodies.com[env, b] - trees.origin[env, trees.root[b]]
             w = wp.spatial_bottom(twist)
             p = m * moved_by(twist, r)
-            force = m * (moved_by(acceleration, r) - gravity) + wp.cross(w, p) - wp.spatial_top(wrench[env, b])
+            force = m * moved_by(acceleration, r) + wp.cross(w, p)
             # The angular momentum about the centre of mass changes by w x I w and by what the acceleration adds.
             inertia = trees.own[env, b]
-            moment = inertia * wp.spatial_bottom(acceleration) + wp.cross(w, inertia * w) - wp.spatial_bottom(wrench[env, b])
+            moment = inertia * wp.spatial_bottom(acceleration) + wp.cross(w, inertia * w)
+            bent[env, b] = h * pair(force, moment)
+            force -= m * gravity + wp.spatial_top(wrench[env, b])
+            moment -= wp.spatial_bottom(wrench[env, b])
             trees.push[env, b] = (-h) * pair(force, moment + wp.cross(r, force))
 
     @wp.func
@@ -297,6 +222,94 @@ def make(real) -> SimpleNamespace:
                 force += rate * (trees.target_rate[env, i] - v[env, i])
             trees.given[env, i] = h * force
 
+    return SimpleNamespace(forces=forces, inertias=inertias, factorise=factorise, matters=matters, impulses=impulses)
+
+
+@functools.cache
+def make(real) -> SimpleNamespace:
+    """Kernels of scenes with joints; ``dynamics`` of any scene. Launch with dim (E)."""
+    t = scalar_types(real)
+    vec3, mat33, quat, transform, spatial = t.vec3, t.mat33, t.quat, t.transform, t.spatial
+    Bodies, Parameters, Topology = t.Bodies, t.Parameters, t.Topology
+    f, of = tree.functions(real), functions(real)
+    Trees, pair, moved_by, propagate = f.Trees, f.pair, f.moved_by, f.propagate
+    added, inertia_along = f.added, f.inertia_along
+    forces, inertias, factorise, matters, impulses = of.forces, of.inertias, of.factorise, of.matters, of.impulses
+    rounding = real(1.0e-16) if real is wp.float64 else real(1.0e-7)
+    settled = real(1.0e-9) if real is wp.float64 else real(1.0e-6)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    def kinematics(
+        q: wp.array2d(dtype=real),
+        v: wp.array2d(dtype=real),
+        topology: Topology,
+        parameters: Parameters,
+        trees: Trees,
+        bodies: Bodies,
+        stride: int,
+    ):
+        """Poses, axes and velocities, from the roots to the leaves."""
+        start, _ = wp.tid()
+        for env in range(start, q.shape[0], stride):
+            for k_b in range(trees.order.shape[0]):
+                b = trees.order[k_b]
+                parent = trees.parent[b]
+                kind = topology.joint_type[b]
+                i_q = topology.q_start[b]
+                com = parameters.com[env % parameters.com.shape[0], b]
+                pose = topology.joint_pose[b]
+                twist = spatial()
+                origin = vec3()
+                if kind == FREE_JOINT or kind == KINEMATIC:  # noqa: SIM109
+                    for k in range(7):
+                        pose[k] = q[env, i_q + k]
+                    # Users write q: a quaternion that is not of unit length would scale the body. Zero gives NaN, which is flagged.
+                    pose = transform(wp.transform_get_translation(pose), wp.normalize(wp.transform_get_rotation(pose)))
+                    origin = wp.transform_point(pose, com)
+                    trees.origin[env, b] = origin
+                    for k in range(3):
+                        i = trees.first[b] + k
+                        axis = vec3()
+                        axis[k] = real(1.0)
+                        trees.screw[env, i] = pair(axis, vec3())
+                        trees.screw[env, i + 3] = pair(vec3(), axis)
+                        twist[k] = v[env, i]
+                        twist[3 + k] = v[env, i + 3]
+                else:
+                    if parent >= 0:
+                        pose = bodies.pose[env, parent] * pose
+                        twist = trees.twist[env, parent]
+                    x = wp.transform_get_translation(pose)
+                    turn = wp.transform_get_rotation(pose)
+                    if trees.root[b] == b:
+                        trees.origin[env, b] = x
+                    origin = trees.origin[env, trees.root[b]]
+                    for i in range(trees.first[b], trees.end[b]):
+                        linear = vec3()
+                        angular = vec3()
+                        if trees.kind[i] == LINEAR:
+                            linear = wp.quat_rotate(turn, trees.axis[i])
+                            x += q[env, i_q] * linear
+                            i_q += 1
+                        else:
+                            if trees.kind[i] == ANGULAR:
+                                turn = turn * wp.quat_from_axis_angle(trees.axis[i], q[env, i_q])
+                                i_q += 1
+                            elif trees.kind[i] == BALL:
+                                turn = turn * wp.normalize(quat(q[env, i_q], q[env, i_q + 1], q[env, i_q + 2], q[env, i_q + 3]))
+                                i_q += 4
+                            angular = wp.quat_rotate(turn, trees.axis[i])
+                            linear = wp.cross(x - origin, angular)
+                        screw = pair(linear, angular)
+                        trees.screw[env, i] = screw
+                        twist += v[env, i] * screw
+                    pose = transform(x, turn) * trees.child_pose[b]
+                bodies.pose[env, b] = pose
+                trees.twist[env, b] = twist
+                centre = wp.transform_point(pose, com)
+                bodies.com[env, b] = centre
+                bodies.velocity[env, b] = pair(moved_by(twist, centre - origin), wp.spatial_bottom(twist))
+
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def dynamics(
         topology: Topology,
@@ -319,7 +332,7 @@ def make(real) -> SimpleNamespace:
                 trees.gained[env, b] = spatial()
             inertias(parameters, trees, bodies, env)
             factorise(parameters, trees, bodies, real(0.0), False, env)
-            forces(topology, parameters, trees, nothing, v, real(1.0), real(1.0), bodies, env)
+            forces(topology, parameters, trees, nothing, v, real(1.0), real(1.0), bodies, trees.gained, env)
             for k in range(trees.order.shape[0]):
                 b = trees.order[trees.order.shape[0] - 1 - k]
                 push = trees.push[env, b]
@@ -351,29 +364,31 @@ def make(real) -> SimpleNamespace:
 
         Loops and contacts that last change as much again, and c is that of the mean velocity of a step: of v and v+, not of v
         and v_free. (A four-bar at 2 ms turns too far by 11 mrad in 2 s with the latter, by 0.02 with the former; what rests would
-        feel c of half of what its weight would give it in a step.) A hit does not last.
+        feel c of half of what its weight would give it in a step.) Not where the user wrote v.
         """
         n = trees.before.shape[0]
         size = real(0.0)
-        changed = real(0.0)
-        freely = real(0.0)  # what v_free was beyond what was expected then
+        part = real(0.5)
         for i in range(n):
             size = wp.max(size, wp.abs(v[env, i]))
-            changed = wp.max(changed, wp.abs(trees.held[env, i]))
-            freely = wp.max(freely, wp.abs(trees.free[env, i] - trees.expected[env, i]))
-        part = real(0.0)
-        if changed <= wp.max(real(LASTING) * size, real(HIT) * freely):
-            part = real(0.5)
+            if v[env, i] != trees.left[env, i]:
+                part = real(0.0)
+        moved = bool(False)
         for i in range(n):
-            trees.expected[env, i] = v[env, i] + part * trees.held[env, i]
-        if part * changed > real(0.0):
+            held = real(0.0)
+            if part > real(0.0):
+                held = part * (trees.left[env, i] - trees.free[env, i])
+                moved = moved or held != real(0.0)
+            trees.expected[env, i] = v[env, i] + held
+            trees.change[env, i] = held
+        if moved:
             for k in range(trees.order.shape[0]):
                 b = trees.order[k]
                 more = spatial()
                 if trees.parent[b] >= 0:
                     more = trees.gained[env, trees.parent[b]]
                 for i in range(trees.first[b], trees.end[b]):
-                    more += (part * trees.held[env, i]) * trees.screw[env, i]
+                    more += trees.change[env, i] * trees.screw[env, i]
                 trees.gained[env, b] = more
                 trees.twist[env, b] = trees.twist[env, b] + more
         return size
@@ -410,7 +425,7 @@ def make(real) -> SimpleNamespace:
             before = real(0.0)
             whole = real(0.0)
             while searching:
-                forces(topology, parameters, trees, wrench, trees.expected, part, h, bodies, env)
+                forces(topology, parameters, trees, wrench, trees.expected, part, h, bodies, trees.bent, env)
                 if rounds == 1:
                     stiffer = matters(parameters, trees, bodies, h, env)
                     stale = stiffer
@@ -466,45 +481,12 @@ def make(real) -> SimpleNamespace:
                         bodies.inv_mass[env, b] = bodies.inv_mass[env, trees.parent[b]]
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def integrate(
-        topology: Topology,
-        trees: Trees,
-        bodies: Bodies,
-        h: real,
-        q: wp.array2d(dtype=real),
-        v: wp.array2d(dtype=real),
-        stride: int,
-    ):
-        """v+ = v_free + M^-1 J^T p and q+ = q + h Gamma(q) v+ (eq. 23)."""
-        start, b = wp.tid()
-        for env in range(start, q.shape[0], stride):
-            for i in range(trees.first[b], trees.end[b]):
-                trees.held[env, i] = trees.change[env, i]
-                v[env, i] = trees.free[env, i] + trees.change[env, i]
-            advance(topology, trees, bodies, v, h, q, env, b)
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
-    def drift(
-        topology: Topology,
-        trees: Trees,
-        bodies: Bodies,
-        h: real,
-        q: wp.array2d(dtype=real),
-        v: wp.array2d(dtype=real),
-        stride: int,
-    ):
-        """q + h Gamma(q) v."""
-        start, b = wp.tid()
-        for env in range(start, q.shape[0], stride):
-            advance(topology, trees, bodies, v, h, q, env, b)
-
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def reset_control(mask: wp.array(dtype=wp.bool), target: wp.array(dtype=real), rate: wp.array(dtype=real), trees: Trees):
-        """Nothing is applied, nothing has held anything, and drives have the model's targets; launch with dim (E)."""
+        """Nothing is applied, no step has left anything, and drives have the model's targets; launch with dim (E)."""
         env = wp.tid()
         if mask[env]:
             for i in range(trees.force.shape[1]):
-                trees.held[env, i] = real(0.0)
+                trees.left[env, i] = real(wp.inf)
                 trees.force[env, i] = real(0.0)
                 trees.target[env, i] = target[i]
                 trees.target_rate[env, i] = rate[i]
@@ -512,8 +494,6 @@ def make(real) -> SimpleNamespace:
     return SimpleNamespace(
         kinematics=kinematics,
         free_motion=free_motion,
-        integrate=integrate,
-        drift=drift,
         reset_control=reset_control,
         dynamics=dynamics,
     )

@@ -27,15 +27,17 @@ def make(real):
     """Kernel ``project``; launch with dim (E), after kinematics, and kinematics after it."""
     t = scalar_types(real)
     vec3 = t.vec3
-    Bodies, Contacts, Topology = t.Bodies, t.Contacts, t.Topology
+    Bodies, Contacts, Parameters, Topology = t.Bodies, t.Contacts, t.Parameters, t.Topology
     f = tree.functions(real)
     Trees, product, scatter, descend = f.Trees, f.product, f.scatter, f.descend
+    moved_by, pair = f.moved_by, f.pair
     advance = tree.motion(real)
     error = joint_rows.functions(real).loop_error
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def project(
         topology: Topology,
+        parameters: Parameters,
         trees: Trees,
         bodies: Bodies,
         contacts: Contacts,
@@ -55,13 +57,13 @@ def make(real):
                 k = -1 - contacts.slot[env, i]
                 kind = trees.row_kind[k]
                 if kind == LOOP_WAY or kind == LOOP_TURN:  # noqa: SIM109 (Warp has no `in`)
-                    pair = trees.row_body[k]
+                    ends = trees.row_body[k]
                     pose_a = trees.row_pose[k, 0]
                     pose_b = trees.row_pose[k, 1]
-                    if pair[0] >= 0:
-                        pose_a = bodies.pose[env, pair[0]] * pose_a
-                    if pair[1] >= 0:
-                        pose_b = bodies.pose[env, pair[1]] * pose_b
+                    if ends[0] >= 0:
+                        pose_a = bodies.pose[env, ends[0]] * pose_a
+                    if ends[1] >= 0:
+                        pose_b = bodies.pose[env, ends[1]] * pose_b
                     _axes, phi = error(kind, pose_a, pose_b, trees.row_held[k], trees.row_length[k])
                     column = int(0)
                     for j in range(first, i + 1):
@@ -118,8 +120,15 @@ def make(real):
                 trees.change[env, k] = wp.sqrt(trees.pivot[env, k]) * trees.change[env, k]
             descend(trees, trees.gained, env)
             for k in range(n):
-                v[env, k] = v[env, k] + trees.change[env, k] / h
+                more = trees.change[env, k] / h
+                v[env, k] = v[env, k] + more
+                trees.left[env, k] = v[env, k]
+                trees.free[env, k] = trees.free[env, k] + more  # no row did it, none will again
             for b in range(trees.order.shape[0]):
+                gained = trees.gained[env, b]
+                m = parameters.mass[env % parameters.mass.shape[0], b]
+                push = m * moved_by(gained, bodies.com[env, b] - trees.origin[env, trees.root[b]])
+                trees.momentum[env, b] += pair(push, trees.own[env, b] * wp.spatial_bottom(gained)) / h
                 advance(topology, trees, bodies, trees.change, real(1.0), q, env, b)
 
     return project

@@ -119,7 +119,10 @@ def functions(real) -> SimpleNamespace:
         calming: wp.array2d(dtype=real)  # [E, V] damping of what no step resolves, N s/m or N m s
         free: wp.array2d(dtype=real)  # [E, V] v_free
         change: wp.array2d(dtype=real)  # [E, V] v+ - v_free in the end; scratch of the solver
-        held: wp.array2d(dtype=real)  # [E, V] v+ - v_free of the step before
+        left: wp.array2d(dtype=real)  # [E, V] v as the step before left it
+        bent: wp.array2d(dtype=spatial)  # [E, B] momentum that c takes from a body in a step, about its centre of mass
+        momentum: wp.array2d(dtype=spatial)  # [E, B] what it goes on with where something was hit
+        landing: wp.array(dtype=int)  # [E] was it?
         expected: wp.array2d(dtype=real)  # [E, V] v and half of what rows may change of it
         longest: int  # D
         half: wp.array2d(dtype=vec3)  # [E, 2 R D] D^-1/2 L^-T J^T of each contact and side, world axes, by depth

@@ -65,6 +65,7 @@ def arrays(sim: Any, Trees: Any) -> Any:
     trees.row_length = sim._constant(np.array([row.length for row in table]), real)
     trees.row_drive = sim._constant(np.array([row.drive for row in table]).reshape(1, -1, 3), t.vec3)
     trees.row_friction = sim._constant(np.array([row.friction for row in table])[None], real)
+    trees.landing = wp.zeros(sim.num_envs, dtype=int, device=sim.device)
     trees.touching = wp.zeros(sim.num_envs, dtype=int, device=sim.device)
     for name, number, dtype in layout(model, real):
         setattr(trees, name, sim._array(number, dtype))
@@ -79,12 +80,12 @@ def layout(model: Model, real: Any) -> list[tuple[str, int, Any]]:
     n, b, longest = model.nv, model.num_bodies, int(where.depth.max()) + 1
     table = (
         ("origin moment pull", b, t.vec3),
-        ("twist gained carried push", b, t.spatial),
+        ("twist gained carried push bent momentum", b, t.spatial),
         ("own inertia virial", b, t.mat33),
         ("articulated", b, wp.types.matrix(shape=(6, 6), dtype=real)),
         ("mass", b, real),
         ("screw taken", n, t.spatial),
-        ("pivot scale given calming free change held expected target target_rate force", n, real),
+        ("pivot scale given calming free change left expected target target_rate force", n, real),
         ("row_scale", extra, t.vec3),
         ("half", 2 * (model.max_contacts + extra) * longest, t.vec3),
     )

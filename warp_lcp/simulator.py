@@ -29,6 +29,7 @@ from .kernels import (
     ellipsoid,
     integrate,
     joint_rows,
+    landing,
     mesh,
     projection,
     reset,
@@ -472,6 +473,7 @@ class Simulator:
         if halves:
             self.launch(k.drift, [self.topology, self.mechanics, self.bodies, 0.5 * h, self.q, self.v], b)
             self._refresh_bodies()
+            self.launch(k.land, [self.parameters, self.mechanics, self.bodies, h, self.v])
         if self.model.articulated:
             self.launch(k.free_motion, [*scene, self.mechanics, self.wrench, self.q, self.v, h, self.bodies])
         else:
@@ -499,7 +501,8 @@ class Simulator:
         if self.bounces is not None:
             self._judge_kernels()
         if self.model.articulated:
-            self.launch(k.integrate, [self.topology, self.mechanics, self.bodies, 0.5 * h if halves else h, self.q, self.v], b)
+            moving = [*scene, self.mechanics, self.bodies, self.next_velocity]
+            self.launch(k.integrate, [*moving, h, 0.5 if halves else 1.0, self.q, self.v])
         elif self._averages:
             self.launch(k.guard, [self.parameters, self.bodies, self.rows, self.next_velocity, h, self.tolerance, self.rounding])
             self.launch(k.integrate_midpoint, [*scene, self.bodies, self.next_velocity, self.wrench, h, self.q, self.v], b)
@@ -508,8 +511,10 @@ class Simulator:
         self._refresh_bodies()
         if self.project_loops:
             for _ in range(projection.ROUNDS):
-                self.launch(k.project, [self.topology, self.mechanics, self.bodies, self.rows, *self._loop_system, self.q, self.v, h])
+                self.launch(k.project, [*scene, self.mechanics, self.bodies, self.rows, *self._loop_system, self.q, self.v, h])
                 self._refresh_bodies()
+        if self.model.articulated and not halves:
+            self.launch(k.land, [self.parameters, self.mechanics, self.bodies, h, self.v])
 
     def _solve_kernels(self, todo: wp.array, number: wp.array, status: wp.array) -> None:
         """The environments todo[:number] by the first method, those left by the next, and so on; each answer certified."""
@@ -734,9 +739,10 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     if model.articulated and articulation.rows(model):
         stages.joint_rows = joint_rows.make(real)
     if model.articulated:
-        stages.integrate, stages.reset_control = body.integrate, body.reset_control
+        ends = landing.make(real)
+        stages.integrate, stages.land, stages.reset_control = ends.integrate, ends.land, body.reset_control
         if integrator == "midpoint":
-            stages.drift = body.drift
+            stages.drift = ends.drift
     elif integrator == "midpoint":
         stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
     else:
