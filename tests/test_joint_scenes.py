@@ -465,8 +465,9 @@ def test_humanoid_stands():
 def test_humanoid_falls_and_lies_still(driven):
     """Pushed off at 1 m/s, also without its drives but for 0.2 N m s/rad: certified, at rest after 8 s, and its energy never rises.
 
-    1e-8 J of 550, springs of drives included; without drives, by 2e-6 J as the last limb lies down: springs of contacts are not counted, and
-    400 N lie 1.4e-8 m deep in the ground, 6e-6 J. (Without any damping limbs swing as Euler's rule has it, which gives and takes 0.01 J.)
+    1e-8 J of 550, springs of drives included; without drives, by 2e-6 J as the last limb lies down: springs of contacts are not
+    counted, and 400 N lie 1.4e-8 m deep in the ground, 6e-6 J. (Without any damping limbs swing as Euler's rule has it, which gives and
+    takes 0.01 J.)
     """
     model = shipped("humanoid")
     start = model.v0.copy()
