@@ -371,7 +371,7 @@ def make(real) -> SimpleNamespace:
         part = real(0.5)
         for i in range(n):
             size = wp.max(size, wp.abs(v[env, i]))
-            if v[env, i] != trees.left[env, i]:
+            if v[env, i] != trees.left[env, i] and trees.kind[i] != PRESCRIBED:
                 part = real(0.0)
         moved = bool(False)
         for i in range(n):

@@ -3,13 +3,14 @@
 
 c (kernels/articulated.py) turns momenta of the bodies with the paths that joints leave them, at velocities near those before the step.
 What is hit moves on with v+, at once: J(q+)^T M J(q+) v+ then differs from J(q)^T M J(q) v+ by h dM/dt(v+) v+, of which c knows
-nothing, and links that whip about gain energy many times over. So do those that turn by a third of a radian in a step, of which c
-knows too little. There v becomes
+nothing, and links that whip about gain energy many times over. So do some that turn by a third of a radian in a step, of which c
+knows too little: more than what v+ has at q, and what c does, says. There v becomes
 
     v := (J+^T M J+)^-1 J+^T M J (v+ + h M^-1 c),   J+ = J(q+), M the masses and inertias of the bodies,
 
 what the joints leave, at q+, of the momenta that bodies had without c. It is a projection in the metric of M: momenta of whole trees stay,
-and energy is lost, by a part of (h w)^2 / 2 in a step that turns by h w. (An inelastic impact with the joints, one might say.)
+and energy is lost, by a part of (h w)^2 in a step that turns by h w. (An inelastic impact with the joints, one might say.) Where
+c was left out (rounds that did not settle) nothing has to be put back. The midpoint rule has no landing: its poses are half-way ones.
 """
 
 import functools
@@ -28,6 +29,11 @@ HIT = wp.constant(2.0)
 BENT = wp.constant(0.1)
 # What was hit lands where momenta are off by this part of their square, by a hundredth: less than that is not worth the factors of a pose.
 MISSED = wp.constant(1.0e-4)
+# What turns by too much lands where the new pose would make this part of the energy.
+MADE = wp.constant(0.01)
+# What lands: what was hit, or what turns by too much.
+HARD = wp.constant(1)
+FAST = wp.constant(2)
 
 
 @functools.cache
@@ -61,6 +67,15 @@ def make(real) -> SimpleNamespace:
         return pair(moved_by(trees.gained[env, b], r), wp.spatial_bottom(trees.gained[env, b]))
 
     @wp.func
+    def energy(parameters: Parameters, trees: Trees, velocity: wp.array2d(dtype=spatial), env: int) -> real:
+        """Twice that of motion, of bodies that forces move, in trees.own's pose [J]."""
+        total = real(0.0)
+        for b in range(trees.order.shape[0]):
+            if trees.last[b] >= 0:
+                total += wp.dot(velocity[env, b], momentum(parameters, trees, velocity[env, b], env, b))
+        return total
+
+    @wp.func
     def matters(
         parameters: Parameters,
         trees: Trees,
@@ -70,16 +85,14 @@ def make(real) -> SimpleNamespace:
         env: int,
     ) -> bool:
         """Is the square of a change of momenta, over masses and moments of inertia, more than this part of that of all?"""
-        whole = real(0.0)
         changed = real(0.0)
         for b in range(trees.order.shape[0]):
             m = parameters.mass[env % parameters.mass.shape[0], b]
             if m > real(0.0) and trees.last[b] >= 0:
-                whole += wp.dot(velocity[env, b], momentum(parameters, trees, velocity[env, b], env, b))
                 push = change[env, b]
                 turning = real(3.0) * wp.length_sq(wp.spatial_bottom(push)) / wp.trace(trees.own[env, b])
                 changed += wp.length_sq(wp.spatial_top(push)) / m + turning
-        return changed > part * whole
+        return changed > part * energy(parameters, trees, velocity, env)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def integrate(
@@ -108,10 +121,22 @@ def make(real) -> SimpleNamespace:
                 changed = wp.max(changed, wp.abs(trees.change[env, i]))
                 freely = wp.max(freely, wp.abs(trees.free[env, i] - trees.expected[env, i]))
             hit = changed > wp.max(real(SUDDEN) * size, real(HIT) * freely)
-            # Half-way poses are those of a leapfrog, which turns by any angle without gain.
+            if hit:
+                for i in range(trees.before.shape[0]):
+                    trees.free[env, i] = trees.left[env, i]  # it is not expected to be hit again
             trees.landing[env] = 0
-            if hit or (part == real(1.0) and matters(parameters, trees, trees.bent, next_velocity, real(BENT), env)):
-                trees.landing[env] = 1
+            # Poses of the midpoint rule are half-way ones: no momentum is of any.
+            if part == real(1.0):
+                if hit:
+                    trees.landing[env] = HARD
+                elif matters(parameters, trees, trees.bent, next_velocity, real(BENT), env):
+                    trees.landing[env] = FAST
+            if trees.landing[env] > 0:
+                trees.allowed[env] = energy(parameters, trees, next_velocity, env)
+                for b in range(trees.order.shape[0]):
+                    if trees.last[b] >= 0:
+                        mean = bodies.velocity[env, b] + next_velocity[env, b]
+                        trees.allowed[env] = trees.allowed[env] + wp.dot(trees.bent[env, b], mean)  # what c does
                 # h M^-1 c, and what it is worth of the impulses along joints.
                 for i in range(trees.before.shape[0]):
                     trees.change[env, i] = real(0.0)
@@ -119,7 +144,7 @@ def make(real) -> SimpleNamespace:
                     push_body(trees, bodies, trees.bent[env, b], env, b)
                 propagate(trees, trees.push, trees.gained, env)
                 for i in range(trees.before.shape[0]):
-                    trees.given[env, i] = added(trees, h, env, i) * trees.change[env, i]
+                    trees.given[env, i] = (added(trees, h, env, i) - h * trees.calming[env, i]) * trees.change[env, i]
                 for b in range(trees.order.shape[0]):
                     trees.momentum[env, b] = momentum(parameters, trees, next_velocity[env, b] + gain(trees, bodies, env, b), env, b)
             for b in range(trees.order.shape[0]):
@@ -130,16 +155,14 @@ def make(real) -> SimpleNamespace:
         """v, and the velocities of bodies, at q+ of what was hit."""
         start, _ = wp.tid()
         for env in range(start, v.shape[0], stride):
-            landing = trees.landing[env] != 0
-            for i in range(trees.before.shape[0]):
-                if v[env, i] != trees.left[env, i]:  # the user wrote it, before half a step of the midpoint rule
-                    landing = False
+            landing = trees.landing[env] > 0
             if landing:
                 inertias(parameters, trees, bodies, env)
+                if trees.landing[env] == FAST:
+                    landing = energy(parameters, trees, bodies.velocity, env) > (real(1.0) + real(MADE)) * trees.allowed[env]
+            if landing:
                 for b in range(trees.order.shape[0]):
                     trees.momentum[env, b] -= momentum(parameters, trees, bodies.velocity[env, b], env, b)
-                for i in range(trees.before.shape[0]):
-                    trees.free[env, i] = v[env, i]  # it is not expected to be hit again
                 landing = matters(parameters, trees, trees.momentum, bodies.velocity, real(MISSED), env)
             if landing:
                 for b in range(trees.order.shape[0]):
@@ -153,7 +176,7 @@ def make(real) -> SimpleNamespace:
                     after = v[env, i] + trees.change[env, i]
                     v[env, i] = after
                     trees.left[env, i] = after
-                    trees.free[env, i] = after
+                    trees.free[env, i] = trees.free[env, i] + trees.change[env, i]  # no row did it
                 for b in range(trees.order.shape[0]):
                     trees.twist[env, b] = trees.twist[env, b] + trees.gained[env, b]
                     bodies.velocity[env, b] = bodies.velocity[env, b] + gain(trees, bodies, env, b)

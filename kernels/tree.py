@@ -122,7 +122,8 @@ def functions(real) -> SimpleNamespace:
         left: wp.array2d(dtype=real)  # [E, V] v as the step before left it
         bent: wp.array2d(dtype=spatial)  # [E, B] momentum that c takes from a body in a step, about its centre of mass
         momentum: wp.array2d(dtype=spatial)  # [E, B] what it goes on with where something was hit
-        landing: wp.array(dtype=int)  # [E] was it?
+        landing: wp.array(dtype=int)  # [E] was it? (kernels/landing.py)
+        allowed: wp.array(dtype=real)  # [E] twice the energy of motion that it may have then
         expected: wp.array2d(dtype=real)  # [E, V] v and half of what rows may change of it
         longest: int  # D
         half: wp.array2d(dtype=vec3)  # [E, 2 R D] D^-1/2 L^-T J^T of each contact and side, world axes, by depth

@@ -65,6 +65,7 @@ def arrays(sim: Any, Trees: Any) -> Any:
     trees.row_length = sim._constant(np.array([row.length for row in table]), real)
     trees.row_drive = sim._constant(np.array([row.drive for row in table]).reshape(1, -1, 3), t.vec3)
     trees.row_friction = sim._constant(np.array([row.friction for row in table])[None], real)
+    trees.allowed = wp.zeros(sim.num_envs, dtype=real, device=sim.device)
     trees.landing = wp.zeros(sim.num_envs, dtype=int, device=sim.device)
     trees.touching = wp.zeros(sim.num_envs, dtype=int, device=sim.device)
     for name, number, dtype in layout(model, real):

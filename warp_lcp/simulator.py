@@ -473,7 +473,6 @@ class Simulator:
         if halves:
             self.launch(k.drift, [self.topology, self.mechanics, self.bodies, 0.5 * h, self.q, self.v], b)
             self._refresh_bodies()
-            self.launch(k.land, [self.parameters, self.mechanics, self.bodies, h, self.v])
         if self.model.articulated:
             self.launch(k.free_motion, [*scene, self.mechanics, self.wrench, self.q, self.v, h, self.bodies])
         else:
@@ -740,9 +739,11 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         stages.joint_rows = joint_rows.make(real)
     if model.articulated:
         ends = landing.make(real)
-        stages.integrate, stages.land, stages.reset_control = ends.integrate, ends.land, body.reset_control
+        stages.integrate, stages.reset_control = ends.integrate, body.reset_control
         if integrator == "midpoint":
             stages.drift = ends.drift
+        else:
+            stages.land = ends.land
     elif integrator == "midpoint":
         stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
     else:
