@@ -40,7 +40,7 @@ FAST = wp.constant(2)
 def make(real) -> SimpleNamespace:
     """Kernels ``integrate``, ``land`` after kinematics at q+, and ``drift``; launch with dim (E), ``drift`` with dim (E, B)."""
     t = scalar_types(real)
-    spatial = t.spatial
+    vec2, vec3, spatial = t.vec2, t.vec3, t.spatial
     Bodies, Parameters, Topology = t.Bodies, t.Parameters, t.Topology
     f, of = tree.functions(real), articulated.functions(real)
     Trees, pair, moved_by, added, propagate = f.Trees, f.pair, f.moved_by, f.added, f.propagate
@@ -67,32 +67,25 @@ def make(real) -> SimpleNamespace:
         return pair(moved_by(trees.gained[env, b], r), wp.spatial_bottom(trees.gained[env, b]))
 
     @wp.func
-    def energy(parameters: Parameters, trees: Trees, velocity: wp.array2d(dtype=spatial), env: int) -> real:
-        """Twice that of motion, of bodies that forces move, in trees.own's pose [J]."""
-        total = real(0.0)
-        for b in range(trees.order.shape[0]):
-            if trees.last[b] >= 0:
-                total += wp.dot(velocity[env, b], momentum(parameters, trees, velocity[env, b], env, b))
-        return total
-
-    @wp.func
-    def matters(
+    def weigh(
         parameters: Parameters,
         trees: Trees,
-        change: wp.array2d(dtype=spatial),
         velocity: wp.array2d(dtype=spatial),
-        part: real,
+        change: wp.array2d(dtype=spatial),
         env: int,
-    ) -> bool:
-        """Is the square of a change of momenta, over masses and moments of inertia, more than this part of that of all?"""
-        changed = real(0.0)
-        for b in range(trees.order.shape[0]):
+    ):
+        """trees.worth of each tree := twice the energy of motion, and the square of a change of momenta over masses and inertias."""
+        for k in range(trees.order.shape[0]):
+            b = trees.order[k]
+            root = trees.root[b]
+            if b == root:
+                trees.worth[env, b] = vec2()
             m = parameters.mass[env % parameters.mass.shape[0], b]
             if m > real(0.0) and trees.last[b] >= 0:
+                whole = wp.dot(velocity[env, b], momentum(parameters, trees, velocity[env, b], env, b))
                 push = change[env, b]
                 turning = real(3.0) * wp.length_sq(wp.spatial_bottom(push)) / wp.trace(trees.own[env, b])
-                changed += wp.length_sq(wp.spatial_top(push)) / m + turning
-        return changed > part * energy(parameters, trees, velocity, env)
+                trees.worth[env, root] = trees.worth[env, root] + vec2(whole, wp.length_sq(wp.spatial_top(push)) / m + turning)
 
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def integrate(
@@ -110,38 +103,48 @@ def make(real) -> SimpleNamespace:
         """v+ = v_free + M^-1 J^T p and q+ = q + part h Gamma(q) v+ (eq. 23)."""
         start, _ = wp.tid()
         for env in range(start, q.shape[0], stride):
-            size = real(0.0)
-            changed = real(0.0)
-            freely = real(0.0)
-            for i in range(trees.before.shape[0]):
-                after = trees.free[env, i] + trees.change[env, i]
-                v[env, i] = after
-                trees.left[env, i] = after
-                size = wp.max(size, wp.abs(after))
-                changed = wp.max(changed, wp.abs(trees.change[env, i]))
-                freely = wp.max(freely, wp.abs(trees.free[env, i] - trees.expected[env, i]))
-            hit = changed > wp.max(real(SUDDEN) * size, real(HIT) * freely)
-            if hit:
-                for i in range(trees.before.shape[0]):
-                    trees.free[env, i] = trees.left[env, i]  # it is not expected to be hit again
-            trees.landing[env] = 0
-            # Poses of the midpoint rule are half-way ones: no momentum is of any.
-            if part == real(1.0):
-                if hit:
-                    trees.landing[env] = HARD
-                elif matters(parameters, trees, trees.bent, next_velocity, real(BENT), env):
-                    trees.landing[env] = FAST
-            if trees.landing[env] > 0:
-                trees.allowed[env] = energy(parameters, trees, next_velocity, env)
-                for b in range(trees.order.shape[0]):
+            # Of each tree the largest velocity, what rows changed, and what v_free was beyond what was expected.
+            for k in range(trees.order.shape[0]):
+                b = trees.order[k]
+                root = trees.root[b]
+                largest = vec3()
+                if b != root:
+                    largest = trees.largest[env, root]
+                for i in range(trees.first[b], trees.end[b]):
+                    after = trees.free[env, i] + trees.change[env, i]
+                    v[env, i] = after
+                    trees.left[env, i] = after
+                    beyond = wp.abs(trees.free[env, i] - trees.expected[env, i])
+                    largest = wp.max(largest, vec3(wp.abs(after), wp.abs(trees.change[env, i]), beyond))
+                trees.largest[env, root] = largest
+            weigh(parameters, trees, next_velocity, trees.bent, env)
+            landing = bool(False)
+            for k in range(trees.order.shape[0]):
+                b = trees.order[k]
+                root = trees.root[b]
+                if b == root:
+                    largest = trees.largest[env, b]
+                    trees.landing[env, b] = 0
+                    if largest[1] > wp.max(real(SUDDEN) * largest[0], real(HIT) * largest[2]):
+                        trees.landing[env, b] = HARD
+                    elif trees.worth[env, b][1] > real(BENT) * trees.worth[env, b][0]:
+                        trees.landing[env, b] = FAST
+                    trees.allowed[env, b] = trees.worth[env, b][0]
+                trees.push[env, b] = spatial()
+                if trees.landing[env, root] > 0:
+                    landing = True
+                    push_body(trees, bodies, trees.bent[env, b], env, b)
                     if trees.last[b] >= 0:
                         mean = bodies.velocity[env, b] + next_velocity[env, b]
-                        trees.allowed[env] = trees.allowed[env] + wp.dot(trees.bent[env, b], mean)  # what c does
+                        trees.allowed[env, root] = trees.allowed[env, root] + wp.dot(trees.bent[env, b], mean)  # what c does
+                if trees.landing[env, root] == HARD:
+                    for i in range(trees.first[b], trees.end[b]):
+                        trees.free[env, i] = trees.left[env, i]  # it is not expected to be hit again
+            # Poses of the midpoint rule are half-way ones: no momentum is of any.
+            if landing and part == real(1.0):
                 # h M^-1 c, and what it is worth of the impulses along joints.
                 for i in range(trees.before.shape[0]):
                     trees.change[env, i] = real(0.0)
-                for b in range(trees.order.shape[0]):
-                    push_body(trees, bodies, trees.bent[env, b], env, b)
                 propagate(trees, trees.push, trees.gained, env)
                 for i in range(trees.before.shape[0]):
                     trees.given[env, i] = (added(trees, h, env, i) - h * trees.calming[env, i]) * trees.change[env, i]
@@ -155,21 +158,34 @@ def make(real) -> SimpleNamespace:
         """v, and the velocities of bodies, at q+ of what was hit."""
         start, _ = wp.tid()
         for env in range(start, v.shape[0], stride):
-            landing = trees.landing[env] > 0
+            landing = bool(False)
+            for b in range(trees.order.shape[0]):
+                landing = landing or (trees.root[b] == b and trees.landing[env, b] > 0)
             if landing:
                 inertias(parameters, trees, bodies, env)
-                if trees.landing[env] == FAST:
-                    landing = energy(parameters, trees, bodies.velocity, env) > (real(1.0) + real(MADE)) * trees.allowed[env]
-            if landing:
                 for b in range(trees.order.shape[0]):
                     trees.momentum[env, b] -= momentum(parameters, trees, bodies.velocity[env, b], env, b)
-                landing = matters(parameters, trees, trees.momentum, bodies.velocity, real(MISSED), env)
+                weigh(parameters, trees, bodies.velocity, trees.momentum, env)
+                landing = bool(False)
+                for k in range(trees.order.shape[0]):
+                    b = trees.order[k]
+                    root = trees.root[b]
+                    if b == root:
+                        worth = trees.worth[env, b]
+                        resolved = trees.landing[env, b] == FAST and worth[0] <= (real(1.0) + real(MADE)) * trees.allowed[env, b]
+                        if resolved or worth[1] <= real(MISSED) * worth[0]:
+                            trees.landing[env, b] = 0
+                    lands = trees.landing[env, root] > 0
+                    landing = landing or lands
+                    trees.push[env, b] = spatial()
+                    if lands:
+                        push_body(trees, bodies, trees.momentum[env, b], env, b)
+                    for i in range(trees.first[b], trees.end[b]):
+                        trees.calming[env, i] = real(0.0)
+                        trees.change[env, i] = real(0.0)
+                        if lands:
+                            trees.change[env, i] = trees.given[env, i]
             if landing:
-                for b in range(trees.order.shape[0]):
-                    push_body(trees, bodies, trees.momentum[env, b], env, b)
-                for i in range(trees.before.shape[0]):
-                    trees.change[env, i] = trees.given[env, i]
-                    trees.calming[env, i] = real(0.0)
                 factorise(parameters, trees, bodies, h, False, env)
                 propagate(trees, trees.push, trees.gained, env)
                 for i in range(trees.before.shape[0]):

@@ -49,7 +49,7 @@ FURTHER = wp.constant(5)
 def functions(real) -> SimpleNamespace:
     """Bundle ``Trees``, and what other stages need of it."""
     t = scalar_types(real)
-    vec3, mat33, transform, spatial = t.vec3, t.mat33, t.transform, t.spatial
+    vec2, vec3, mat33, transform, spatial = t.vec2, t.vec3, t.mat33, t.transform, t.spatial
     mat66 = wp.types.matrix(shape=(6, 6), dtype=real)
 
     @wp.struct
@@ -122,8 +122,11 @@ def functions(real) -> SimpleNamespace:
         left: wp.array2d(dtype=real)  # [E, V] v as the step before left it
         bent: wp.array2d(dtype=spatial)  # [E, B] momentum that c takes from a body in a step, about its centre of mass
         momentum: wp.array2d(dtype=spatial)  # [E, B] what it goes on with where something was hit
-        landing: wp.array(dtype=int)  # [E] was it? (kernels/landing.py)
-        allowed: wp.array(dtype=real)  # [E] twice the energy of motion that it may have then
+        # Of a tree, at its root (kernels/landing.py):
+        landing: wp.array2d(dtype=int)  # [E, B] was it hit, or turned by too much?
+        allowed: wp.array2d(dtype=real)  # [E, B] twice the energy of motion that it may have at q+
+        worth: wp.array2d(dtype=vec2)  # [E, B] twice the energy of motion, and the same of a change of momenta
+        largest: wp.array2d(dtype=vec3)  # [E, B] velocity, what rows changed of one, and what v_free was beyond what was expected
         expected: wp.array2d(dtype=real)  # [E, V] v and half of what rows may change of it
         longest: int  # D
         half: wp.array2d(dtype=vec3)  # [E, 2 R D] D^-1/2 L^-T J^T of each contact and side, world axes, by depth

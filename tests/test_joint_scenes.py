@@ -534,3 +534,72 @@ def test_links_that_fall_make_no_energy(kind, closed):
     levels = (0.5 * model.mass * (velocity[..., :3] ** 2).sum(-1) + model.mass * GRAVITY * pose[..., 2]).sum(-1) + turning
     assert (levels[-1] < 0.5 * levels[0]).all()
     assert (levels.max(axis=0) > 1.1 * levels[0]).mean() <= 0.1
+
+
+def fan(builder: wl.ModelBuilder, speed: float) -> int:
+    """A mass of 1 kg, 0.5 m off the vertical axis of its hinge; returns the body."""
+    blade = builder.add_body(pose=(0.5, 0, 2, 0, 0, 0, 1), mass=1.0, inertia=0.01 * np.eye(3))
+    builder.add_joint(JointType.REVOLUTE, -1, blade, parent_frame=(0, 0, 2, *joints.about(1, -np.pi / 2)), start_velocity=speed, **ARM)
+    return blade
+
+
+ARM = {"child_frame": (-0.5, 0, 0, *joints.about(1, -np.pi / 2))}
+
+
+def test_what_turns_fast_and_is_not_hit_is_left_alone():
+    """A fan at 0.6 rad a step: M is the same in every pose, and so is its speed, to round-off in 200 steps."""
+    builder = wl.ModelBuilder()
+    fan(builder, 120.0)
+    sim = simulator(builder.finalize(), dt=5e-3)
+    sim.step(200)
+    assert sim.v.numpy()[0, 0] == pytest.approx(120.0, rel=1e-12)
+
+
+def test_what_is_hit_is_told_tree_by_tree():
+    """A ball that hits the ground 50 m away changes nothing of a pendulum of two rods at 20 rad/s, nor they of the ball."""
+
+    def scene(with_ball: bool, with_rods: bool) -> wl.ModelBuilder:
+        builder = wl.ModelBuilder()
+        builder.add_plane()
+        if with_rods:
+            rods = [builder.add_body(pose=(0.5 + k, 0, 4, 0, 0, 0, 1), mass=1.0, inertia=0.01 * np.eye(3)) for k in range(2)]
+            for parent, rod in zip((-1, rods[0]), rods, strict=True):
+                at = (0, 0, 4) if parent < 0 else (0.5, 0, 0)
+                frames = {"parent_frame": (*at, *joints.about(0, np.pi / 2)), "child_frame": (-0.5, 0, 0, *joints.about(0, np.pi / 2))}
+                builder.add_joint(JointType.REVOLUTE, parent, rod, start_velocity=20.0, **frames)
+        else:
+            fan(builder, 0.0)
+        ball = builder.add_body(pose=(50, 0, 0.11 if with_ball else 1e3, 0, 0, 0, 1), velocity=(3, 0, -2))
+        builder.add_sphere(ball, 0.1)
+        return builder
+
+    moved = [simulator(scene(*which).finalize(), dt=5e-3).rollout(100).v.numpy()[:, 0] for which in ((1, 1), (0, 1), (1, 0))]
+    assert np.ptp(moved[0][:, 4]) > 0.5  # it was stopped
+    assert np.abs(moved[0][:, :2] - moved[1][:, :2]).max() < 1e-10
+    assert np.abs(moved[0][:, 2:] - moved[2][:, 1:]).max() < 1e-10
+
+
+def test_velocity_of_a_kinematic_body_may_be_written_every_step():
+    """It changes no bit of a four-bar beside it: what a step changed of the loop is not forgotten, as where its own v is written."""
+    corners = np.array([[0, 0, 2.0], [0, 0, 1.0], [1, 0, 1.0], [1, 0, 2.0]])
+    builder, place, bars = wl.ModelBuilder(), {}, [-1]
+    for start, end in pairwise(corners):
+        bars.append(rod(builder, start, end))
+        place[bars[-1]] = 0.5 * (start + end)
+    place[-1] = np.zeros(3)
+    for k, point in enumerate(corners):
+        hinge(builder, bars[k], bars[(k + 1) % 4], point, "y", place, loop=k == 3, start_velocity=8.0 if k == 0 else 0.0)
+    builder.add_box(builder.add_body(pose=(9, 9, 9, 0, 0, 0, 1), joint=JointType.KINEMATIC), (0.1, 0.1, 0.1))
+    ends = {}
+    for written in ("nothing", "the kinematic body", "all"):
+        sim = simulator(builder.finalize(), dt=5e-3)
+        moving = slice(-6, None) if written == "the kinematic body" else slice(None)
+        for _ in range(50):
+            if written != "nothing":
+                v = sim.v.numpy()
+                v[:, moving] += 1e-13
+                sim.v.assign(v)
+            sim.step()
+        ends[written] = sim.q.numpy()[0, 0]
+    assert ends["the kinematic body"] == ends["nothing"]
+    assert abs(ends["all"] - ends["nothing"]) > 1e-4

@@ -65,8 +65,6 @@ def arrays(sim: Any, Trees: Any) -> Any:
     trees.row_length = sim._constant(np.array([row.length for row in table]), real)
     trees.row_drive = sim._constant(np.array([row.drive for row in table]).reshape(1, -1, 3), t.vec3)
     trees.row_friction = sim._constant(np.array([row.friction for row in table])[None], real)
-    trees.allowed = wp.zeros(sim.num_envs, dtype=real, device=sim.device)
-    trees.landing = wp.zeros(sim.num_envs, dtype=int, device=sim.device)
     trees.touching = wp.zeros(sim.num_envs, dtype=int, device=sim.device)
     for name, number, dtype in layout(model, real):
         setattr(trees, name, sim._array(number, dtype))
@@ -80,11 +78,13 @@ def layout(model: Model, real: Any) -> list[tuple[str, int, Any]]:
     t, where, extra = scalar_types(real), paths(model), len(rows(model))
     n, b, longest = model.nv, model.num_bodies, int(where.depth.max()) + 1
     table = (
-        ("origin moment pull", b, t.vec3),
+        ("origin moment pull largest", b, t.vec3),
+        ("worth", b, t.vec2),
+        ("landing", b, int),
         ("twist gained carried push bent momentum", b, t.spatial),
         ("own inertia virial", b, t.mat33),
         ("articulated", b, wp.types.matrix(shape=(6, 6), dtype=real)),
-        ("mass", b, real),
+        ("mass allowed", b, real),
         ("screw taken", n, t.spatial),
         ("pivot scale given calming free change left expected target target_rate force", n, real),
         ("row_scale", extra, t.vec3),
