@@ -565,7 +565,7 @@ def test_what_is_hit_is_told_tree_by_tree():
             rods = [builder.add_body(pose=(0.5 + k, 0, 4, 0, 0, 0, 1), mass=1.0, inertia=0.01 * np.eye(3)) for k in range(2)]
             for parent, rod in zip((-1, rods[0]), rods, strict=True):
                 at = (0, 0, 4) if parent < 0 else (0.5, 0, 0)
-                frames = {"parent_frame": (*at, *joints.about(0, np.pi / 2)), "child_frame": (-0.5, 0, 0, *joints.about(0, np.pi / 2))}
+                frames = {"parent_frame": (*at, *joints.about(2, np.pi / 2)), "child_frame": (-0.5, 0, 0, *joints.about(2, np.pi / 2))}
                 builder.add_joint(JointType.REVOLUTE, parent, rod, start_velocity=20.0, **frames)
         else:
             fan(builder, 0.0)
