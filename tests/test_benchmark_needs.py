@@ -47,13 +47,13 @@ def test_ledger_is_what_a_simulator_takes(name):
 def test_shipped_scenes_compile_kernels_of_what_is_in_them(name):
     """A kernel for each kind of pair, of restitution where something bounces, of joints, of one or of several bodies; and no other."""
     scene = wl.load_usd(name)
-    stages = {"kinematics", "free_motion", "combine_pairs", "select_contacts", "certify", "integrate", "reset", "proximal_contacts", "pgs"}
+    stages = {"kinematics", "free_motion", "combine_pairs", "select_contacts", "certify", "integrate", "reset", "proximal_contacts"}
     pairs = {"_".join(wl.ShapeType(scene.shape_type[s]).name.lower() for s in pair) for pair in scene.pairs}
     bounds = {"bounds", "list_pairs"} if any(not name.startswith("plane") for name in pairs) else set()
     bounces = {"bounce", "judge", "settle"} if scene.bounces else set()
     single = scene.dofs == 6
     rows = {"contact_rows"} if bounces or not single else set()
-    joints = {"reset_control", "land"} if scene.articulated else set()
+    joints = {"reset_control", "land"} if scene.articulated else {"pgs"}
     joints |= {"joint_rows"} if ledger(scene)["joint_rows"] else set()
     joints |= {"calm_overlaps"} if scene.articulated and scene.bodies_meet else set()
     assert set(ledger(scene)["kernels"]) == stages | pairs | bounds | bounces | rows | joints | {"solve_single" if single else "pivot"}

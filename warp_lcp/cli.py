@@ -217,7 +217,7 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
     total = 2 * 8 * (model.nq + model.nv)  # q, q0, v, v0
     total += 2 * model.num_bodies * wp.types.type_size_in_bytes(types.spatial)  # wrench, next velocity
     total += 4 * 4 + 3 * 8  # status, iterations, unsolved, reason; residuals
-    methods = [method(model, wp.float64, law) for method in chosen("auto", "float64", law)]
+    methods = [method(model, wp.float64, law) for method in chosen("auto", "float64", law, model.articulated)]
     total += 4 * (len(methods) + any(method.judges for method in methods))  # lists of environments
     total += 4 * (len(model.kind_pairs) + len(model.pairs))  # list of pairs
     if model.articulated:

@@ -279,8 +279,8 @@ METHODS: dict[str, tuple[Callable[[Model, Any, Law], Any], ...]] = {
 }
 
 
-def chosen(name: str, precision: str, law: Law) -> tuple[Callable[[Model, Any, Law], Any], ...]:
-    """The methods behind a name, for a precision and a law.
+def chosen(name: str, precision: str, law: Law, articulated: bool) -> tuple[Callable[[Model, Any, Law], Any], ...]:
+    """The methods behind a name, for a precision, a law, and a model with joints or without.
 
     float32 does not resolve the stiffness of Table 1: a velocity of 5 m/s is known to 5e-7 m/s, and over eps_n that is
     more than the impulse itself. The proximal method and block PGS do not divide by eps, so they are what 'auto' means there.
@@ -289,7 +289,10 @@ def chosen(name: str, precision: str, law: Law) -> tuple[Callable[[Model, Any, L
         WarpLcpError: where the method does not take the law, or not in this precision.
     """
     if name == "auto":
-        return METHODS["auto"] if law.has_axes and precision == "float64" else METHODS["auto"][1:]
+        if law.has_axes and precision == "float64":
+            # With joints block PGS had nothing left to solve (docs/design.md), and takes an eighth of the time to compile.
+            return METHODS["auto"][:2] if articulated else METHODS["auto"]
+        return METHODS["auto"][1:]
     if name == "velocity_pivoting":
         if precision == "float32":
             raise WarpLcpError(f"method {name!r} needs precision 'float64': float32 does not resolve contact stiffness; choose 'auto'")

@@ -134,8 +134,8 @@ class Simulator:
         dt: step size h [s].
         formulation: contact law, see docs/theory.md: 'phantom_inertia', 'anitescu_potra', 'box', 'hybrid' or 'coulomb' (the exact cone).
         method: how the contact problem is solved: 'velocity_pivoting', 'proximal_newton', 'pgs', 'lemke', 'murty', 'judice_pires', or
-            'auto': velocity pivoting where the law has axes (not in float32), then the proximal Newton method, then pgs, each for
-            the environments that are not solved by then.
+            'auto': velocity pivoting where the law has axes (not in float32), then the proximal Newton method, then pgs (not where both
+            come before it and the model has joints), each for the environments that are not solved by then.
         sliding: how 'phantom_inertia' slides: 'regularized' (eqs. 34 and 43), 'aligned' (eq. 34) or 'facets' (fixed axes
             throughout). The other laws do not ask: 'hybrid' is regularized, 'anitescu_potra' and 'box' have facets, 'coulomb' the cone.
         directions: k, friction directions of a sticking contact (with facets, of a sliding one too), at least 2; 'coulomb' has none.
@@ -681,7 +681,8 @@ class Simulator:
         if self.project_loops:
             n = 3 * sum(row.kind in (tree.LOOP_WAY, tree.LOOP_TURN) for row in articulation.rows(self.model))
             self._loop_system = (wp.zeros((self.num_envs, n, n), dtype=self.real, device=self.device), self._array(n, self.real))
-        self._methods = [method(self.model, self.real, self.law) for method in chosen(self.method, self.precision, self.law)]
+        methods = chosen(self.method, self.precision, self.law, self.model.articulated)
+        self._methods = [method(self.model, self.real, self.law) for method in methods]
         self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator, self._methods[0].makes_rows)
         if self.project_loops:
             self._kernels.project = projection.make(self.real)
@@ -773,7 +774,7 @@ def kernel_names(
 ) -> list[str]:
     """Names of the kernels that a Simulator of the model compiles."""
     real, law = PRECISIONS[precision][0], law or Law()
-    methods = [kind(model, real, law) for kind in chosen(method, precision, law)]
+    methods = [kind(model, real, law) for kind in chosen(method, precision, law, model.articulated)]
     stages, pairs = stage_kernels(model, real, integrator, methods[0].makes_rows)
     solvers = [kind.kernel for kind in methods]
     return [kernel.key.rpartition("__")[2] for kernel in (*vars(stages).values(), *dict.fromkeys(k for k, *_ in pairs), *solvers)]
