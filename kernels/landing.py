@@ -140,7 +140,7 @@ def make(real) -> SimpleNamespace:
                 if trees.landing[env, root] == HARD:
                     for i in range(trees.first[b], trees.end[b]):
                         trees.free[env, i] = trees.left[env, i]  # it is not expected to be hit again
-            # Poses of the midpoint rule are half-way ones: no momentum is of any.
+            # Not by the midpoint rule, which has moved by half a step only.
             if landing and part == real(1.0):
                 # h M^-1 c, and what it is worth of the impulses along joints.
                 for i in range(trees.before.shape[0]):

@@ -506,7 +506,7 @@ def necklace(kind: JointType, closed: bool) -> wl.Model:
     return builder.finalize()
 
 
-LOCKS = pytest.mark.xfail(strict=True, reason="hinges that turn by a radian in a step lock, and closing the ring takes any energy")
+LOCKS = pytest.mark.xfail(strict=True, reason="a ring of hinges that turn by a radian in a step gains energy, 11 of 128; why is not known")
 
 
 @pytest.mark.parametrize(
