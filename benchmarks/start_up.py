@@ -38,6 +38,7 @@ def one(name: str, scene: str | Path) -> dict[str, Any]:
     row: dict[str, Any] = {"scene": name}
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"WARP_CACHE_PATH": cache, "PYTHONPATH": str(ROOT)}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python keeps it by default, and then has it in the second process
         for state in ("cold", "warm"):
             done = subprocess.run([sys.executable, "-c", CODE, str(scene)], env=environment, stdout=subprocess.PIPE, text=True, check=True)
             read, step, modules = done.stdout.split()[-3:]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import enum
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -681,13 +681,8 @@ class Simulator:
         if self.project_loops:
             n = 3 * sum(row.kind in (tree.LOOP_WAY, tree.LOOP_TURN) for row in articulation.rows(self.model))
             self._loop_system = (wp.zeros((self.num_envs, n, n), dtype=self.real, device=self.device), self._array(n, self.real))
-        methods = chosen(self.method, self.precision, self.law, self.model.articulated)
-        self._methods = [method(self.model, self.real, self.law) for method in methods]
-        self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator, self._methods[0].makes_rows)
-        if self.project_loops:
-            self._kernels.project = projection.make(self.real)
-        for method in self._methods[1:]:
-            method.take_rows()
+        self.kernels: list[Any] = []
+        self._load(self._make_kernels())
         for method in self._methods:
             method.prepare(self)
         # Environments that each method but the last leaves to the next, and those whose answer a method could not certify itself.
@@ -696,27 +691,40 @@ class Simulator:
         self.queued: wp.array = wp.zeros(left, dtype=int, device=self.device)
         self.doubtful: wp.array = wp.empty(doubtful, dtype=int, device=self.device)
         self.num_doubtful: wp.array = wp.zeros(1, dtype=int, device=self.device)
-        pair_kernels = list(dict.fromkeys(kernel for kernel, *_ in self._pair_kernels))
         if any(with_hulls for *_, with_hulls in self._pair_kernels):
             self.hulls, self._meshes = hulls.arrays(self.model, self)  # the latter so that they live as long
-        self.kernels: list[Any] = []
-        self._load([*(m.kernel for m in reversed(self._methods)), *pair_kernels, *vars(self._kernels).values()])  # long ones first
 
-    def _load(self, kernels: list[Any]) -> None:
-        """Compile kernels, side by side, and put them on the device."""
-        self.kernels += kernels
+    def _make_kernels(self) -> Iterator[Any]:
+        yield reset.make(self.real)  # with the first one Warp compiles headers of its own, while the others are made
+        methods = chosen(self.method, self.precision, self.law, self.model.articulated)
+        self._methods = [method(self.model, self.real, self.law) for method in methods]
+        self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator, self._methods[0].makes_rows)
+        if self.project_loops:
+            self._kernels.project = projection.make(self.real)
+        for method in self._methods[1:]:
+            method.take_rows()
+        yield from (method.kernel for method in reversed(self._methods))  # long ones first
+        yield from dict.fromkeys(kernel for kernel, *_ in self._pair_kernels)
+        yield from (kernel for kernel in vars(self._kernels).values() if kernel is not self._kernels.reset)
+
+    def _load(self, kernels: Iterable[Any]) -> None:
+        """Compile kernels, side by side and while the next are made, and put them on the device."""
 
         def load(kernel: Any) -> None:
             wp.force_load(self.device, modules=[kernel.module], block_dim=kernel.module.options["block_dim"])
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            for done in [pool.submit(load, kernel) for kernel in kernels]:
+            begun = []
+            for kernel in kernels:
+                self.kernels.append(kernel)
+                begun.append(pool.submit(load, kernel))
+            for done in begun:
                 done.result()
 
 
 def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, bool]]]:
     """Kernels of the stages by name, and (kernel, number of pairs, does it take hulls?) for each kind of pair in the model."""
-    rows, motion = contacts.make(real, model.articulated), integrate.make(real)
+    rows = contacts.make(real, model.articulated)
     body = articulated.make(real) if model.articulated else bodies.make(real)
     stages = SimpleNamespace(
         kinematics=body.kinematics,
@@ -746,9 +754,10 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         else:
             stages.land = ends.land
     elif integrator == "midpoint":
+        motion = integrate.make(real)
         stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
     else:
-        stages.integrate = motion.integrate
+        stages.integrate = integrate.make(real).integrate
     pairs = []
     for first, end in pairwise(model.kind_pairs):
         kind = tuple(ShapeType(model.shape_type[s]).name for s in model.pairs[first])
