@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import tree
-from .tree import ANGULAR, BALL, BALL_ON, FREE, LINEAR, PRESCRIBED
+from .tree import ANGULAR, BALL, BALL_ON, FREE, HARD, LINEAR, PRESCRIBED
 from .types import FREE as FREE_JOINT
 from .types import KINEMATIC, OPTIONS, scalar_types
 
@@ -411,6 +411,7 @@ def make(real) -> SimpleNamespace:
                 trees.calming[env, i] = real(0.0)
             for b in range(trees.order.shape[0]):
                 trees.gained[env, b] = spatial()
+                trees.landing[env, b] = 0
             impulses(trees, q, v, h, env)
             inertias(parameters, trees, bodies, env)
             searching = bool(True)
@@ -453,6 +454,7 @@ def make(real) -> SimpleNamespace:
                     # and joints calmed, as turning from one pose to another feeds them.
                     part = real(0.0)
                     for b in range(trees.order.shape[0]):
+                        trees.landing[env, b] = HARD
                         for i in range(trees.first[b], trees.end[b]):
                             if trees.kind[i] < FREE:
                                 inertia = inertia_along(trees, h, env, b, i)

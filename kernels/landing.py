@@ -10,7 +10,8 @@ knows too little: more than what v+ has at q, and what c does, says. There v bec
 
 what the joints leave, at q+, of the momenta that bodies had without c. It is a projection in the metric of M: momenta of whole trees stay,
 and energy is lost, by a part of (h w)^2 in a step that turns by h w. (An inelastic impact with the joints, one might say.) Where
-c was left out (rounds that did not settle) nothing has to be put back. The midpoint rule has no landing: its poses are half-way ones.
+c was left out (rounds that did not settle) all land, and nothing has to be put back. The midpoint rule has no landing: its poses are
+half-way ones.
 """
 
 import functools
@@ -19,6 +20,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import articulated, tree
+from .tree import FAST, HARD
 from .types import OPTIONS, scalar_types
 
 # What rows changed was a hit if it was more than this part of the largest velocity, and more than this many times what v_free was beyond
@@ -31,9 +33,6 @@ BENT = wp.constant(0.1)
 MISSED = wp.constant(1.0e-4)
 # What turns by too much lands where the new pose would make this part of the energy.
 MADE = wp.constant(0.01)
-# What lands: what was hit, or what turns by too much.
-HARD = wp.constant(1)
-FAST = wp.constant(2)
 
 
 @functools.cache
@@ -124,8 +123,8 @@ def make(real) -> SimpleNamespace:
                 root = trees.root[b]
                 if b == root:
                     largest = trees.largest[env, b]
-                    trees.landing[env, b] = 0
-                    if largest[1] > wp.max(real(SUDDEN) * largest[0], real(HIT) * largest[2]):
+                    hit = largest[1] > wp.max(real(SUDDEN) * largest[0], real(HIT) * largest[2])
+                    if hit or trees.landing[env, b] == HARD:
                         trees.landing[env, b] = HARD
                     elif trees.worth[env, b][1] > real(BENT) * trees.worth[env, b][0]:
                         trees.landing[env, b] = FAST

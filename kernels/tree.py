@@ -43,6 +43,9 @@ LOOP_WAY = wp.constant(2)
 LOOP_TURN = wp.constant(3)
 CLOSER = wp.constant(4)
 FURTHER = wp.constant(5)
+# What lands (Trees.landing, kernels/landing.py): what was hit or has no c, or what turns by too much.
+HARD = wp.constant(1)
+FAST = wp.constant(2)
 
 
 @functools.cache

@@ -506,7 +506,9 @@ def necklace(kind: JointType, closed: bool) -> wl.Model:
     return builder.finalize()
 
 
-LOCKS = pytest.mark.xfail(strict=True, reason="a ring of hinges that turn by a radian in a step gains energy, 11 of 128; why is not known")
+LOCKS = pytest.mark.xfail(
+    strict=True, reason="a ring of hinges at a radian a step gains energy, 9 of 128: it opens further than it is closed"
+)
 
 
 @pytest.mark.parametrize(
@@ -519,21 +521,42 @@ def test_links_that_fall_make_no_energy(kind, closed):
     Where v of what was hit stayed what it was at the pose before (kernels/landing.py), two in five gained energy, up to 800 times of it,
     and kept it. Now one in fifty, closed to a ring one in eight, has more for a step or two, as what overlaps or is apart is put right.
     """
-    model = necklace(kind, closed)
-    sim, rng = simulator(model, num_envs=32, dt=5e-3), np.random.default_rng(0)
+    levels = energies_of_falls(necklace(kind, closed), 5e-3)
+    assert (levels[-1] < 0.5 * levels[0]).all()
+    assert (levels.max(axis=0) > 1.1 * levels[0]).mean() <= 0.25
+
+
+def test_where_c_is_left_out_links_land():
+    """The ring of hinges at 10 ms: where rounds for c do not settle it gained 33,000-fold while it did not land then, and 90-fold now."""
+    levels = energies_of_falls(necklace(JointType.REVOLUTE, True), 1e-2)
+    assert (levels.max(axis=0) < 1e3 * levels[0]).all()
+
+
+def energies_of_falls(model: wl.Model, h: float, **options) -> np.ndarray:
+    """[steps, 32] energies [J] for 2 s, from 32 starts."""
+    sim, rng = simulator(model, num_envs=32, dt=h, **options), np.random.default_rng(0)
     v, q = 0.5 * rng.normal(size=(32, model.nv)), sim.q0.numpy().copy()
     v[:, 6:] = 0.0
     q[:, :2] += 0.2 * rng.normal(size=(32, 2))
     sim.q0.assign(q)
     sim.v0.assign(v)
     sim.reset()
-    moved = sim.rollout(400, record=("body_pose", "body_velocity"))
+    moved = sim.rollout(round(2.0 / h), record=("body_pose", "body_velocity"))
     pose, velocity = moved.body_pose.numpy(), moved.body_velocity.numpy()
     spin = rotate(pose[..., 3:] * [-1, -1, -1, 1], velocity[..., 3:])
     turning = 0.5 * np.einsum("tebi,bij,tebj->te", spin, model.inertia, spin)
-    levels = (0.5 * model.mass * (velocity[..., :3] ** 2).sum(-1) + model.mass * GRAVITY * pose[..., 2]).sum(-1) + turning
+    return (0.5 * model.mass * (velocity[..., :3] ** 2).sum(-1) + model.mass * GRAVITY * pose[..., 2]).sum(-1) + turning
+
+
+def test_a_flat_ring_that_is_projected_makes_no_energy():
+    """Hinges along its links: flat, as it starts, five of its six rows let nothing move and soon do, by next to nothing.
+
+    Where the projection kept rounds that left loops further apart it turned hinges by five radians to close 0.2 mm, and every ring flew
+    apart at its first hit. The limit of a tenth is that of the test above, for what overlaps; what was measured is 1.06 of 128.
+    """
+    levels = energies_of_falls(necklace(JointType.REVOLUTE, True), 2e-3, project_loops=True)
     assert (levels[-1] < 0.5 * levels[0]).all()
-    assert (levels.max(axis=0) > 1.1 * levels[0]).mean() <= 0.25
+    assert (levels.max(axis=0) < 1.1 * levels[0]).all()
 
 
 def fan(builder: wl.ModelBuilder, speed: float) -> int:

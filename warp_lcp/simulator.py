@@ -509,8 +509,9 @@ class Simulator:
             self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
         self._refresh_bodies()
         if self.project_loops:
-            for _ in range(projection.ROUNDS):
-                self.launch(k.project, [*scene, self.mechanics, self.bodies, self.rows, *self._loop_system, self.q, self.v, h])
+            loops = [*scene, self.mechanics, self.bodies, self.rows, *self._loop_system, self.q, self.v, h]
+            for again in range(projection.ROUNDS):
+                self.launch(k.project, [*loops, again, self._apart])
                 self._refresh_bodies()
         if self.model.articulated and not halves:
             self.launch(k.land, [self.parameters, self.mechanics, self.bodies, h, self.v])
@@ -681,6 +682,7 @@ class Simulator:
         if self.project_loops:
             n = 3 * sum(row.kind in (tree.LOOP_WAY, tree.LOOP_TURN) for row in articulation.rows(self.model))
             self._loop_system = (wp.zeros((self.num_envs, n, n), dtype=self.real, device=self.device), self._array(n, self.real))
+            self._apart: wp.array = wp.zeros(self.num_envs, dtype=self.real, device=self.device)
         self.kernels: list[Any] = []
         self._load(self._make_kernels())
         for method in self._methods:
