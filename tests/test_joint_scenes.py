@@ -131,6 +131,12 @@ def test_midpoint_rule_with_joints():
         assert errors[0] / errors[1] == pytest.approx(4.0, abs=0.5)
 
 
+def test_fourbar_is_not_braked_at_20_ms():
+    """0.28 rad a step, and off by 0.035 rad after 2 s: what was taken for a hit, or for too fast, never came over the top (2.4 rad)."""
+    coarse, fine = (run(shipped("fourbar"), 2.0, h).q.numpy()[-1, 0, 0] for h in (2e-2, 5e-4))
+    assert abs(coarse - fine) < 0.05
+
+
 def test_fourbar_does_not_come_apart_in_100_s():
     """The last ten seconds are no worse than 1.1 times the first ten; of second order in h."""
     opened = []
@@ -507,7 +513,7 @@ def necklace(kind: JointType, closed: bool) -> wl.Model:
 
 
 LOCKS = pytest.mark.xfail(
-    strict=True, reason="a ring of hinges at a radian a step gains energy, 9 of 128: it opens further than it is closed"
+    strict=True, reason="a ring of hinges at a radian a step gains energy, 8 of 128: it opens further than it is closed"
 )
 
 
