@@ -3,15 +3,15 @@
 
 c (kernels/articulated.py) turns momenta of the bodies with the paths that joints leave them, at velocities near those before the step.
 What is hit moves on with v+, at once: J(q+)^T M J(q+) v+ then differs from J(q)^T M J(q) v+ by h dM/dt(v+) v+, of which c knows
-nothing, and links that whip about gain energy many times over. So do some that turn by half a radian in a step, of which c
+nothing, and links that whip about gain energy many times over. So do some that turn by 0.4 radians in a step, of which c
 knows too little: more than what v+ has at q, and what c does, says. There v becomes
 
     v := (J+^T M J+)^-1 J+^T M J (v+ + h M^-1 c),   J+ = J(q+), M the masses and inertias of the bodies,
 
 what the joints leave, at q+, of the momenta that bodies had without c. It is a projection in the metric of M: momenta of whole trees stay,
 and energy is lost, by a part of (h w)^2 in a step that turns by h w. (An inelastic impact with the joints, one might say.) Where
-c was left out (rounds that did not settle) all land, and nothing has to be put back. The midpoint rule has no landing: its poses are
-half-way ones.
+c was left out (rounds that did not settle) trees land as what was hit does, and nothing has to be put back. The midpoint rule has no
+landing: its poses are half-way ones.
 """
 
 import functools
@@ -23,9 +23,9 @@ from . import articulated, tree
 from .tree import FAST, HARD
 from .types import OPTIONS, scalar_types
 
-# What rows changed was a hit if it was, but for what they changed a step ago, more than this part of the largest velocity, and more than
-# this many times what v_free was beyond what was expected. (What rests is changed by as much as its weight gave it, a loop that turns
-# back by as much as its pull was: no hits.)
+# What rows changed was a hit if it was, and less what they changed a step ago still is, more than this part of the largest velocity, and
+# more than this many times what v_free was beyond what was expected. (What rests is changed by as much as its weight gave it, a loop
+# that turns back by as much as its pull was: no hits.)
 SUDDEN = wp.constant(0.25)
 HIT = wp.constant(2.0)
 # A step turns bodies by too much where it changes the square of their momenta, over their masses, by this part: by some 0.4 rad.
@@ -88,6 +88,11 @@ def make(real) -> SimpleNamespace:
                 turning = real(3.0) * wp.length_sq(wp.spatial_bottom(push)) / wp.trace(trees.own[env, b])
                 trees.worth[env, root] = trees.worth[env, root] + vec2(whole, wp.length_sq(wp.spatial_top(push)) / m + turning)
 
+    @wp.func
+    def was_hit(largest: vec3) -> bool:
+        """By trees.largest of a tree."""
+        return largest[1] > wp.max(real(SUDDEN) * largest[0], real(HIT) * largest[2])
+
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def integrate(
         topology: Topology,
@@ -113,7 +118,8 @@ def make(real) -> SimpleNamespace:
                     largest = trees.largest[env, root]
                 for i in range(trees.first[b], trees.end[b]):
                     after = trees.free[env, i] + trees.change[env, i]
-                    sudden = wp.abs(trees.change[env, i] - real(2.0) * (trees.expected[env, i] - v[env, i]))
+                    change = trees.change[env, i]
+                    sudden = wp.min(wp.abs(change), wp.abs(change - real(2.0) * (trees.expected[env, i] - v[env, i])))
                     beyond = wp.abs(trees.free[env, i] - trees.expected[env, i])
                     largest = wp.max(largest, vec3(wp.abs(after), sudden, beyond))
                     v[env, i] = after
@@ -126,8 +132,7 @@ def make(real) -> SimpleNamespace:
                 root = trees.root[b]
                 if b == root:
                     largest = trees.largest[env, b]
-                    hit = largest[1] > wp.max(real(SUDDEN) * largest[0], real(HIT) * largest[2])
-                    if hit or trees.landing[env, b] == HARD:
+                    if was_hit(largest) or trees.landing[env, b] == HARD:
                         trees.landing[env, b] = HARD
                     elif trees.worth[env, b][1] > real(BENT) * trees.worth[env, b][0]:
                         trees.landing[env, b] = FAST
@@ -139,7 +144,7 @@ def make(real) -> SimpleNamespace:
                     if trees.last[b] >= 0:
                         mean = bodies.velocity[env, b] + next_velocity[env, b]
                         trees.allowed[env, root] = trees.allowed[env, root] + wp.dot(trees.bent[env, b], mean)  # what c does
-                if trees.landing[env, root] == HARD:
+                if was_hit(trees.largest[env, root]):
                     for i in range(trees.first[b], trees.end[b]):
                         trees.free[env, i] = trees.left[env, i]  # it is not expected to be hit again
             # Not by the midpoint rule, which has moved by half a step only.

@@ -5,8 +5,9 @@ With phi(q) what loops are apart by, a Newton step is delta = -M^-1 J^T (J M^-1 
 in the mass norm; Bayo and Ledesma 1996). J and M are those of the step before it, so a round leaves a part of the order h of phi. The
 velocities change by delta / h: moved there in the step, as by SHAKE (Ryckaert et al. 1977); positions alone would take five times
 the energy that Euler's rule takes. Rows that repeat others, and poses in which loops lock, are no harm: a thousandth of its diagonal
-makes their matrix definite. Where a loop is about to lock or unlock, J is quite another at the next pose: a round that leaves loops
-further apart is taken back, and is the last of the step. (A flat ring of hinges along its sides turned them by 5 rad to close 0.2 mm.)
+makes their matrix definite. Where a loop is about to lock or unlock, J is quite another at the next pose: a round that leaves the loops
+of an environment further apart is taken back, and is the last of the step. (A flat ring of hinges along its sides turned them by 5 rad
+to close 0.2 mm.)
 """
 
 import functools
@@ -17,8 +18,8 @@ from . import joint_rows, tree
 from .tree import LOOP_TURN, LOOP_WAY
 from .types import OPTIONS, scalar_types
 
-# Rounds in a step.
-ROUNDS = 5
+# Rounds in a step, and another that only looks at what the last one did.
+ROUNDS = wp.constant(5)
 # Of the diagonal.
 REGULAR = wp.constant(1.0e-3)
 
@@ -71,7 +72,6 @@ def make(real):
                     if ends[1] >= 0:
                         pose_b = bodies.pose[env, ends[1]] * pose_b
                     _axes, phi = error(kind, pose_a, pose_b, trees.row_held[k], trees.row_length[k])
-                    total += wp.dot(phi, phi)
                     column = int(0)
                     for j in range(first, i + 1):
                         other = trees.row_kind[-1 - contacts.slot[env, j]]
@@ -83,9 +83,10 @@ def make(real):
                                     system[env, size + r, column + c] = block[r, c]
                             column += 3
                     for r in range(3):
-                        right[env, size + r] = -phi[r]
-                        if contacts.inv_mass[env, i][r] == real(0.0):
-                            right[env, size + r] = real(0.0)
+                        right[env, size + r] = real(0.0)
+                        if contacts.inv_mass[env, i][r] > real(0.0):
+                            right[env, size + r] = -phi[r]
+                            total += phi[r] * phi[r]
                     size += 3
             n = trees.before.shape[0]
             if again > 0 and total > apart[env]:
@@ -94,6 +95,8 @@ def make(real):
                     trees.change[env, k] = -trees.change[env, k]
                 for b in range(trees.order.shape[0]):
                     trees.push[env, b] = -trees.push[env, b]
+            elif again == ROUNDS:
+                continue
             else:
                 apart[env] = total
                 # Cholesky's factors in place, and both substitutions.

@@ -129,7 +129,7 @@ def functions(real) -> SimpleNamespace:
         landing: wp.array2d(dtype=int)  # [E, B] was it hit, or turned by too much?
         allowed: wp.array2d(dtype=real)  # [E, B] twice the energy of motion that it may have at q+
         worth: wp.array2d(dtype=vec2)  # [E, B] twice the energy of motion, and the same of a change of momenta
-        largest: wp.array2d(dtype=vec3)  # [E, B] velocity, what rows changed of one, and what v_free was beyond what was expected
+        largest: wp.array2d(dtype=vec3)  # [E, B] velocity, what rows changed of one at once, and what v_free was beyond what was expected
         expected: wp.array2d(dtype=real)  # [E, V] v and half of what rows may change of it
         longest: int  # D
         half: wp.array2d(dtype=vec3)  # [E, 2 R D] D^-1/2 L^-T J^T of each contact and side, world axes, by depth

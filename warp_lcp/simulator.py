@@ -510,7 +510,7 @@ class Simulator:
         self._refresh_bodies()
         if self.project_loops:
             loops = [*scene, self.mechanics, self.bodies, self.rows, *self._loop_system, self.q, self.v, h]
-            for again in range(projection.ROUNDS):
+            for again in range(projection.ROUNDS + 1):
                 self.launch(k.project, [*loops, again, self._apart])
                 self._refresh_bodies()
         if self.model.articulated and not halves:
@@ -697,9 +697,9 @@ class Simulator:
             self.hulls, self._meshes = hulls.arrays(self.model, self)  # the latter so that they live as long
 
     def _make_kernels(self) -> Iterator[Any]:
-        yield reset.make(self.real)  # with the first one Warp compiles headers of its own, while the others are made
         methods = chosen(self.method, self.precision, self.law, self.model.articulated)
         self._methods = [method(self.model, self.real, self.law) for method in methods]
+        yield reset.make(self.real)  # with the first one Warp compiles headers of its own, while the others are made
         self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator, self._methods[0].makes_rows)
         if self.project_loops:
             self._kernels.project = projection.make(self.real)
