@@ -72,6 +72,7 @@ def make(real):
                     if ends[1] >= 0:
                         pose_b = bodies.pose[env, ends[1]] * pose_b
                     _axes, phi = error(kind, pose_a, pose_b, trees.row_held[k], trees.row_length[k])
+                    total += wp.dot(phi, phi)  # rows in which nothing moved too: that they open says more than what J does
                     column = int(0)
                     for j in range(first, i + 1):
                         other = trees.row_kind[-1 - contacts.slot[env, j]]
@@ -86,7 +87,6 @@ def make(real):
                         right[env, size + r] = real(0.0)
                         if contacts.inv_mass[env, i][r] > real(0.0):
                             right[env, size + r] = -phi[r]
-                            total += phi[r] * phi[r]
                     size += 3
             n = trees.before.shape[0]
             if again > 0 and total > apart[env]:
