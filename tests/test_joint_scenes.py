@@ -520,7 +520,7 @@ def test_links_that_fall_make_no_energy(kind, closed):
     """Undamped, at 5 ms, 25 J at the start: links that hit something whip about at 50 to 150 rad/s, up to half a turn in four steps.
 
     Where v of what was hit stayed what it was at the pose before (kernels/landing.py), two in five gained energy, up to 800 times of it,
-    and kept it. Now one in fifty, closed to a ring one in eight, has more for a step or two, as what overlaps or is apart is put right.
+    and kept it. Now one in forty, closed to a ring one in ten, has more for a step or two, as what overlaps or is apart is put right.
     """
     levels = energies_of_falls(necklace(kind, closed), 5e-3)
     assert (levels[-1] < 0.5 * levels[0]).all()
