@@ -25,10 +25,10 @@ from .types import DISC, HELD, scalar_types
 
 
 @functools.cache
-def functions(real, joints: bool = False) -> SimpleNamespace:
+def functions(real, joints: bool = False, facets: bool = True) -> SimpleNamespace:
     """``project_friction``, ``admissible`` (pi), ``slope`` (its generalised derivative), ``weigh`` and ``law_error``.
 
-    joints: there may be rows of joints that close loops (HELD) among the contacts.
+    joints: there may be rows of joints that close loops (HELD) among the contacts; facets: and sets other than {0}, disc and rectangle.
     """
     t = scalar_types(real)
     vec2, vec3, mat33 = t.vec2, t.vec3, t.mat33
@@ -56,12 +56,13 @@ def functions(real, joints: bool = False) -> SimpleNamespace:
             size = wp.length(x)
             if size > limit[0]:
                 result = x * (limit[0] / size)
-        elif k != 0:
-            result = x
-            e, distance, half = facet(x, k)
-            if wp.dot(x, e) > distance * limit[0]:
-                across = vec2(-e[1], e[0])
-                result = limit[0] * distance * e + wp.clamp(wp.dot(x, across), -half * limit[0], half * limit[0]) * across
+        elif wp.static(facets):  # noqa: SIM102
+            if k != 0:
+                result = x
+                e, distance, half = facet(x, k)
+                if wp.dot(x, e) > distance * limit[0]:
+                    across = vec2(-e[1], e[0])
+                    result = limit[0] * distance * e + wp.clamp(wp.dot(x, across), -half * limit[0], half * limit[0]) * across
         return result
 
     @wp.func
@@ -108,26 +109,27 @@ def functions(real, joints: bool = False) -> SimpleNamespace:
             elif limit[0] > real(0.0):
                 d[1, 1] = real(1.0)
                 d[2, 2] = real(1.0)
-        elif k != 0:
-            y = vec2(x[1], x[2])
-            e, distance, half = facet(y, k)
-            across = vec2(-e[1], e[0])
-            if wp.dot(y, e) <= distance * limit[0]:
-                if limit[0] > real(0.0):
-                    d[1, 1] = real(1.0)
-                    d[2, 2] = real(1.0)
-            else:
-                corner = distance * e
-                along = wp.dot(y, across)
-                if wp.abs(along) <= half * limit[0]:
-                    d[1, 1] = across[0] * across[0]
-                    d[1, 2] = across[0] * across[1]
-                    d[2, 1] = d[1, 2]
-                    d[2, 2] = across[1] * across[1]
+        elif wp.static(facets):  # noqa: SIM102
+            if k != 0:
+                y = vec2(x[1], x[2])
+                e, distance, half = facet(y, k)
+                across = vec2(-e[1], e[0])
+                if wp.dot(y, e) <= distance * limit[0]:
+                    if limit[0] > real(0.0):
+                        d[1, 1] = real(1.0)
+                        d[2, 2] = real(1.0)
                 else:
-                    corner += wp.sign(along) * half * across
-                d[1, 0] = grows * mu[0] * corner[0]
-                d[2, 0] = grows * mu[0] * corner[1]
+                    corner = distance * e
+                    along = wp.dot(y, across)
+                    if wp.abs(along) <= half * limit[0]:
+                        d[1, 1] = across[0] * across[0]
+                        d[1, 2] = across[0] * across[1]
+                        d[2, 1] = d[1, 2]
+                        d[2, 2] = across[1] * across[1]
+                    else:
+                        corner += wp.sign(along) * half * across
+                    d[1, 0] = grows * mu[0] * corner[0]
+                    d[2, 0] = grows * mu[0] * corner[1]
         if wp.static(joints):  # noqa: SIM102
             if k == HELD:
                 d = wp.identity(n=3, dtype=real)

@@ -137,40 +137,6 @@ def make(real):
             d = phi / h
         return w / (h * (h * k + b)), d
 
-    @wp.func
-    def write(
-        contacts: Contacts,
-        env: int,
-        n: int,
-        k: int,
-        body: wp.vec2i,
-        point: vec3,
-        frame: mat33,
-        w: vec3,
-        eps: vec3,
-        shift: vec3,
-        free: vec3,
-        bound: vec2,
-        directions: int,
-        state: int,
-    ):
-        contacts.slot[env, n] = -1 - k
-        contacts.body[env, n] = body
-        contacts.point[env, n] = point
-        contacts.gap[env, n] = real(0.0)
-        contacts.closed[env, n] = 1
-        contacts.frame[env, n] = frame
-        contacts.inv_mass[env, n] = w
-        contacts.relaxation[env, n] = eps
-        contacts.shift[env, n] = shift
-        contacts.free[env, n] = free + shift
-        contacts.mu[env, n] = vec2()
-        contacts.bound[env, n] = bound
-        contacts.directions[env, n] = directions
-        contacts.damping[env, n] = real(0.0)
-        contacts.impulse[env, n] = vec3()
-        contacts.state[env, n] = state
-
     @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
     def joint_rows(
         trees: Trees,
@@ -182,160 +148,169 @@ def make(real):
         stride: int,
     ):
         start, _ = wp.tid()
+        sides = int(2)  # as variables: Warp would write out the loops below, which makes twice the code of them
+        axes = int(3)
         for env in range(start, contacts.count.shape[0], stride):
             n = contacts.count[env]
             trees.touching[env] = n
             for k in range(trees.row_kind.shape[0]):
                 kind = trees.row_kind[k]
                 i = trees.row_velocity[k]
+                body = trees.row_body[k]
+                # Rows of what point, along what, how far they are from where they stop or hold, and do any of them matter?
+                point = vec3()
+                frame = wp.identity(n=3, dtype=real)
+                phi = vec3()
+                needed = bool(True)
+                stops = bool(False)  # is row n kept from falling below zero?
+                directions = int(HELD)
+                free = vec3()
+                scale = vec3()
+                length = real(1.0)
+                stiff = real(0.0)
+                friction = real(0.0)
+                drive = vec3()
                 if i >= 0:
-                    body = trees.row_owner[k]
                     sign = real(1.0)
                     if kind == LIMIT_HIGH:
                         sign = real(-1.0)
                     drive = trees.row_drive[env % trees.row_drive.shape[0], k]
                     friction = trees.row_friction[env % trees.row_friction.shape[0], k]
-                    position = q[env, trees.coordinate[i]]
-                    gap = sign * (position - trees.row_limit[k])
-                    near = gap < real(2.0) * h * wp.max(wp.abs(v[env, i]), wp.abs(trees.free[env, i])) + real(1.0e-6)
+                    gap = sign * (q[env, trees.coordinate[i]] - trees.row_limit[k])
+                    stops = gap < real(2.0) * h * wp.max(wp.abs(v[env, i]), wp.abs(trees.free[env, i])) + real(1.0e-6)
                     stiff = h * (h * drive[0] + drive[1])
-                    if near or stiff > real(0.0) or friction > real(0.0):
-                        length = real(1.0)
-                        if trees.kind[i] != LINEAR:
-                            length = wp.sqrt(inertia_along(trees, h, env, body, i) / trees.mass[env, body])
-                        scale = vec3()
-                        if near:
-                            scale[0] = sign * length
-                        if stiff > real(0.0):
-                            scale[1] = length
-                        if friction > real(0.0):
-                            scale[2] = length
-                        first = (2 * n + 1) * trees.longest
-                        j = trees.last[body]
-                        while j >= 0:
-                            trees.half[env, first + trees.depth[j]] = vec3()
-                            j = trees.before[j]
-                        taken = trees.taken[env, i]
-                        trees.half[env, first + trees.depth[i]] = trees.scale[env, i] * scale
-                        force = -wp.outer(wp.spatial_top(taken), scale)
-                        divide(trees, env, first, trees.before[i], force, -wp.outer(wp.spatial_bottom(taken), scale))
-                        trees.row_scale[env, k] = scale
-                        contacts.body[env, n] = wp.vec2i(-1, body)
-                        w = wp.get_diag(product(trees.shared, trees.half, contacts.body, trees.longest, env, n, n))
-                        eps = vec3(real(1.0))
-                        shift = vec3()
-                        free = trees.free[env, i] * scale
-                        state = int(0)
-                        if near:
-                            eps_n, d = stop(length * gap, h, w[0])
-                            eps[0] = eps_n
-                            shift[0] = d
-                            if free[0] + d < real(0.0):
-                                state = 1
-                        else:
-                            shift[0] = real(1.0)
-                        if stiff > real(0.0):
-                            eps[1] = length * length / stiff
-                            pull = h * (drive[0] * (trees.target[env, i] - position) + drive[1] * trees.target_rate[env, i])
-                            shift[1] = -length * pull / stiff
-                        if friction > real(0.0):
-                            eps[2] = real(FRICTION_RELAXATION) * w[2]
-                        bound = vec2(h * drive[2] / length, h * friction / length)
-                        write(
-                            contacts,
-                            env,
-                            n,
-                            k,
-                            wp.vec2i(-1, body),
-                            bodies.com[env, body],
-                            wp.identity(n=3, dtype=real),
-                            w,
-                            eps,
-                            shift,
-                            free,
-                            bound,
-                            2,
-                            state,
-                        )
-                        n += 1
+                    needed = stops or stiff > real(0.0) or friction > real(0.0)
+                    directions = 2
+                    point = bodies.com[env, body[1]]
+                    if needed and trees.kind[i] != LINEAR:
+                        length = wp.sqrt(inertia_along(trees, h, env, body[1], i) / trees.mass[env, body[1]])
+                    phi[0] = length * gap
+                    if stops:
+                        scale[0] = sign * length
+                    if stiff > real(0.0):
+                        scale[1] = length
+                    if friction > real(0.0):
+                        scale[2] = length
+                    free = trees.free[env, i] * scale
                 else:
-                    pair = trees.row_body[k]
                     pose_a = trees.row_pose[k, 0]
                     pose_b = trees.row_pose[k, 1]
-                    if pair[0] >= 0:
-                        pose_a = bodies.pose[env, pair[0]] * pose_a
-                    if pair[1] >= 0:
-                        pose_b = bodies.pose[env, pair[1]] * pose_b
+                    if body[0] >= 0:
+                        pose_a = bodies.pose[env, body[0]] * pose_a
+                    if body[1] >= 0:
+                        pose_b = bodies.pose[env, body[1]] * pose_b
                     point = wp.transform_get_translation(pose_b)
                     frame, phi = loop_error(kind, pose_a, pose_b, trees.row_held[k], trees.row_length[k])
-                    directions = int(HELD)
-                    needed = bool(True)
                     if kind != LOOP_WAY and kind != LOOP_TURN:
                         apart = point - wp.transform_get_translation(pose_a)
                         directions = 0
+                        stops = bool(True)
                         distance = wp.length(apart)
                         away = real(-1.0)
                         if kind == CLOSER:
                             away = real(1.0)
                         along = apart * (away / wp.max(distance, real(1.0e-9)))
-                        for c in range(3):
+                        for c in range(axes):
                             frame[0, c] = along[c]
                         phi[0] = away * (distance - trees.row_limit[k])
                     # Velocities of b relative to a there, present and free.
                     u = vec3()
                     u_free = vec3()
-                    for side in range(2):
-                        body = pair[side]
-                        if body >= 0:
+                    for side in range(sides):
+                        b = body[side]
+                        if b >= 0:
                             s = real(2 * side - 1)
-                            present = wp.spatial_bottom(bodies.velocity[env, body])
-                            ahead = wp.spatial_bottom(bodies.free_velocity[env, body])
+                            present = wp.spatial_bottom(bodies.velocity[env, b])
+                            ahead = wp.spatial_bottom(bodies.free_velocity[env, b])
                             if kind != LOOP_TURN:
-                                arm = point - bodies.com[env, body]
-                                present = wp.spatial_top(bodies.velocity[env, body]) + wp.cross(present, arm)
-                                ahead = wp.spatial_top(bodies.free_velocity[env, body]) + wp.cross(ahead, arm)
+                                arm = point - bodies.com[env, b]
+                                present = wp.spatial_top(bodies.velocity[env, b]) + wp.cross(present, arm)
+                                ahead = wp.spatial_top(bodies.free_velocity[env, b]) + wp.cross(ahead, arm)
                             u += s * present
                             u_free += s * ahead
-                    if directions == 0:
+                    if stops:
                         needed = phi[0] < real(2.0) * h * wp.max(wp.length(u), wp.length(u_free)) + real(1.0e-6)
-                    if needed:
-                        for side in range(2):
-                            body = pair[side]
-                            if body >= 0:
-                                force = mat33()
-                                moment = wp.identity(n=3, dtype=real)
-                                if kind != LOOP_TURN:
-                                    force = wp.identity(n=3, dtype=real)
-                                    moment = wp.skew(point - trees.origin[env, trees.root[body]])
-                                divide(trees, env, (2 * n + side) * trees.longest, trees.last[body], force, moment)
-                        contacts.body[env, n] = pair
+                    free = frame * u_free
+                if needed:
+                    alone = real(0.0)  # mobility that the bodies would have without their joints
+                    for side in range(sides):
+                        b = body[side]
+                        if b >= 0:
+                            alone += bodies.inv_mass[env, b]
+                            first = (2 * n + side) * trees.longest
+                            last = trees.last[b]
+                            force = mat33()
+                            moment = wp.identity(n=3, dtype=real)
+                            if i >= 0:
+                                while last >= 0:
+                                    trees.half[env, first + trees.depth[last]] = vec3()
+                                    last = trees.before[last]
+                                trees.half[env, first + trees.depth[i]] = trees.scale[env, i] * scale
+                                last = trees.before[i]
+                                force = -wp.outer(wp.spatial_top(trees.taken[env, i]), scale)
+                                moment = -wp.outer(wp.spatial_bottom(trees.taken[env, i]), scale)
+                            elif kind != LOOP_TURN:
+                                force = wp.identity(n=3, dtype=real)
+                                moment = wp.skew(point - trees.origin[env, trees.root[b]])
+                            divide(trees, env, first, last, force, moment)
+                    contacts.body[env, n] = body
+                    w = vec3()
+                    if i >= 0:
+                        trees.row_scale[env, k] = scale
+                        last = trees.last[body[1]]
+                        while last >= 0:
+                            y = trees.half[env, (2 * n + 1) * trees.longest + trees.depth[last]]
+                            w += wp.cw_mul(y, y)
+                            last = trees.before[last]
+                    else:
                         mobility = product(trees.shared, trees.half, contacts.body, trees.longest, env, n, n)
-                        w_row = wp.get_diag(frame * mobility * wp.transpose(frame))
-                        eps = vec3(real(1.0))
-                        shift = vec3()
-                        if directions == 0:
-                            eps_n, d = stop(phi[0], h, w_row[0])
-                            eps[0] = eps_n
-                            shift[0] = d
-                        else:
-                            alone = real(0.0)  # what the bodies would have without their joints
-                            for side in range(2):
-                                if pair[side] >= 0:
-                                    alone += bodies.inv_mass[env, pair[side]]
-                            for r in range(3):
-                                if w_row[r] > real(IMMOBILE) * alone:
-                                    eps[r] = loop_relaxation * w_row[r]
-                                    shift[r] = wp.clamp(phi[r] / h, -real(MAX_CORRECTION), real(MAX_CORRECTION))
-                                else:
-                                    for c in range(3):
-                                        frame[r, c] = real(0.0)
-                                    w_row[r] = real(0.0)
-                        free = frame * u_free
-                        state = int(0)
-                        if free[0] + shift[0] < real(0.0):
-                            state = 1
-                        write(contacts, env, n, k, pair, point, frame, w_row, eps, shift, free, vec2(), directions, state)
-                        n += 1
+                        w = wp.get_diag(frame * mobility * wp.transpose(frame))
+                    eps = vec3(real(1.0))
+                    shift = vec3()
+                    bound = vec2()
+                    if stops:
+                        eps_n, d = stop(phi[0], h, w[0])
+                        eps[0] = eps_n
+                        shift[0] = d
+                    if i >= 0:
+                        if not stops:
+                            shift[0] = real(1.0)
+                        if stiff > real(0.0):
+                            eps[1] = length * length / stiff
+                            pull = drive[0] * (trees.target[env, i] - q[env, trees.coordinate[i]]) + drive[1] * trees.target_rate[env, i]
+                            shift[1] = -length * (h * pull) / stiff
+                        if friction > real(0.0):
+                            eps[2] = real(FRICTION_RELAXATION) * w[2]
+                        bound = vec2(h * drive[2] / length, h * friction / length)
+                    elif not stops:
+                        for r in range(axes):
+                            if w[r] > real(IMMOBILE) * alone:
+                                eps[r] = loop_relaxation * w[r]
+                                shift[r] = wp.clamp(phi[r] / h, -real(MAX_CORRECTION), real(MAX_CORRECTION))
+                            else:
+                                for c in range(axes):
+                                    frame[r, c] = real(0.0)
+                                w[r] = real(0.0)
+                                free[r] = real(0.0)
+                    state = int(0)
+                    if free[0] + shift[0] < real(0.0):
+                        state = 1
+                    contacts.slot[env, n] = -1 - k
+                    contacts.point[env, n] = point
+                    contacts.gap[env, n] = real(0.0)
+                    contacts.closed[env, n] = 1
+                    contacts.frame[env, n] = frame
+                    contacts.inv_mass[env, n] = w
+                    contacts.relaxation[env, n] = eps
+                    contacts.shift[env, n] = shift
+                    contacts.free[env, n] = free + shift
+                    contacts.mu[env, n] = vec2()
+                    contacts.bound[env, n] = bound
+                    contacts.directions[env, n] = directions
+                    contacts.damping[env, n] = real(0.0)
+                    contacts.impulse[env, n] = vec3()
+                    contacts.state[env, n] = state
+                    n += 1
             contacts.count[env] = n
 
     return joint_rows

@@ -255,7 +255,7 @@ def make(real, cone: bool, frozen: bool, trees: bool = False) -> SimpleNamespace
     Contacts = t.Contacts
     f = functions(real, cone, frozen, trees)
     operator, update = f.operator, f.update
-    law = friction.functions(real, trees)
+    law = friction.functions(real, trees, facets=False)  # laws with two axes or a disc are all that this method takes
     admissible, slope, weigh = law.admissible, law.slope, law.weigh
     s = sparse.functions(real, 6)
     Graph, clear_factors, factorise, solve = s.Graph, s.clear_factors, s.factorise, s.solve

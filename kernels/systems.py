@@ -268,6 +268,7 @@ def trees(real) -> SimpleNamespace:
     def prepare(ws: Workspace, m: Trees, body: wp.array2d(dtype=wp.vec2i), env: int, slot: int, r: int, lane: int):
         """The nodes of each contact and its J^T in their unknowns."""
         sides = 2 * ws.nodes.shape[1]
+        two = int(2)  # as a variable: Warp would write out the loop
         for i in range(lane, r, wp.block_dim()):
             pair = body[env, i]
             for k in range(sides):
@@ -275,15 +276,13 @@ def trees(real) -> SimpleNamespace:
                 ws.node[slot, i * sides + k] = b
                 if b >= 0:
                     arm = mat63()
-                    for side in range(2):
+                    for side in range(two):
                         if pair[side] >= 0:
-                            for c in range(6):
+                            for c in range(ws.velocity.shape[1]):
                                 v = ws.velocity[b, c]
                                 if v >= 0:  # noqa: SIM102
                                     if m.path[pair[side], m.depth[v]] == v:
-                                        y = real(2 * side - 1) * m.half[env, (2 * i + side) * m.longest + m.depth[v]]
-                                        for d in range(3):
-                                            arm[c, d] = arm[c, d] + y[d]
+                                        arm[c] = arm[c] + real(2 * side - 1) * m.half[env, (2 * i + side) * m.longest + m.depth[v]]
                     ws.arm[slot, i * sides + k] = arm
         sync()
 

@@ -87,8 +87,7 @@ def functions(real) -> SimpleNamespace:
         # Rows of joints beside those of contacts (kernels/joint_rows.py), K of them at most:
         row_kind: wp.array(dtype=int)  # [K]
         row_velocity: wp.array(dtype=int)  # [K] of a limit, drive or friction; -1
-        row_owner: wp.array(dtype=int)  # [K] body above which that velocity is
-        row_body: wp.array(dtype=wp.vec2i)  # [K] of a loop or distance: a, b; -1 = world
+        row_body: wp.array(dtype=wp.vec2i)  # [K] of a loop or distance: a, b; of a velocity: -1, the body below its joint; -1 = world
         row_pose: wp.array2d(dtype=transform)  # [K, 2] frames on a and b
         row_held: wp.array(dtype=wp.vec3i)  # [K] of a loop: which axes of the frame on a it holds
         row_limit: wp.array(dtype=real)  # [K] m or rad
@@ -244,18 +243,20 @@ def functions(real) -> SimpleNamespace:
     ) -> mat33:
         """Block (i, j) of J M^-1 J^T, world axes."""
         total = mat33()
-        for x in range(2):
-            for y in range(2):
-                a = body[env, i][x]
-                b = body[env, j][y]
-                if a >= 0 and b >= 0:
-                    block = mat33()
-                    for d in range(shared[a, b]):
-                        block += wp.outer(half[env, (2 * i + x) * longest + d], half[env, (2 * j + y) * longest + d])
-                    if x == y:
-                        total += block
-                    else:
-                        total -= block
+        sides = int(2)  # as a variable: Warp would write out the loops, which makes four times the code
+        for x in range(sides):
+            a = body[env, i][x]
+            if a >= 0:
+                for y in range(sides):
+                    b = body[env, j][y]
+                    if b >= 0:
+                        block = mat33()
+                        for d in range(shared[a, b]):
+                            block += wp.outer(half[env, (2 * i + x) * longest + d], half[env, (2 * j + y) * longest + d])
+                        if x == y:
+                            total += block
+                        else:
+                            total -= block
         return total
 
     @wp.func

@@ -54,7 +54,7 @@ def arrays(sim: Any, Trees: Any) -> Any:
     trees.rate = sim._constant(np.where(unbounded, drive[:, 1], 0.0)[None], real)
     trees.coordinate = sim.ints(coordinates(model))
     table = rows(model)
-    for name in ("kind", "velocity", "owner", "held"):
+    for name in ("kind", "velocity", "held"):
         values = np.array([getattr(row, name) for row in table], dtype=np.int32)
         setattr(
             trees, f"row_{name}", sim.ints(values) if name != "held" else wp.array(values.reshape(-1, 3), dtype=wp.vec3i, device=sim.device)
@@ -99,7 +99,6 @@ class Row:
 
     kind: int
     velocity: int = -1
-    owner: int = -1
     bodies: tuple[int, int] = (-1, -1)
     frames: np.ndarray = field(default_factory=lambda: np.tile([0.0, 0, 0, 0, 0, 0, 1], (2, 1)))
     held: tuple[bool, bool, bool] = (False, False, False)
@@ -116,11 +115,11 @@ def rows(model: Model) -> list[Row]:
         (low, high), drive, friction = model.limit[i], model.drive[i], float(model.joint_friction[i])
         is_row = bool(np.isfinite(drive[2]) and drive[:2].any())
         bounded = (float(drive[0]), float(drive[1]), float(drive[2])) if is_row else (0.0, 0.0, 0.0)
-        owner = int(model.dof_body[i])
+        bodies = (-1, int(model.dof_body[i]))
         if np.isfinite(low) or any(bounded) or friction > 0.0:
-            table.append(Row(int(tree.LIMIT_LOW), i, owner, limit=low, drive=bounded, friction=friction))
+            table.append(Row(int(tree.LIMIT_LOW), i, bodies, limit=low, drive=bounded, friction=friction))
         if np.isfinite(high):
-            table.append(Row(int(tree.LIMIT_HIGH), i, owner, limit=high))
+            table.append(Row(int(tree.LIMIT_HIGH), i, bodies, limit=high))
     for loop in model.loops:
         if not model.movable[list(loop.bodies)].any():
             continue  # nothing that forces move
