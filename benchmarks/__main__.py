@@ -126,11 +126,15 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
     sub.add_argument("--formulations", type=lambda text: text.split(","), default=["phantom_inertia", "coulomb"], metavar="NAME,...")
     sub.add_argument("--envs", type=int, default=4096, help="environments of each scene (default 4096)")
     sub.add_argument("--seconds", type=float, default=10.0, help="simulated time (default 10)")
-    command(
+    sub = command(
         "start-up",
         run_start_up,
         "from a fresh process to the first step of robots and others, with an empty cache and a full one (CPU)",
         out,
+        place,
+    )
+    sub.add_argument(
+        "--peers", type=partial(peer_names, known=known), default=",".join(known), metavar="all|none|NAME,...", help="default: %(default)s"
     )
     command("resources", run_resources, "what the kernels take of a GPU", out)
     command("needs", run_needs, "what each scene takes and uses, and what features elsewhere cost it (CPU)", out, quick)
@@ -371,9 +375,12 @@ def run_robust(asked: argparse.Namespace) -> None:
 
 
 def run_start_up(asked: argparse.Namespace) -> None:
-    rows = start_up.measure()
+    present, absent = peers.split(asked.peers, asked.dir)
+    if absent:
+        print(absent)
+    rows = start_up.measure(present, asked.dir)
     print(start_up.markdown(rows))
-    keep(asked, wp.get_device("cpu"), {"rows": rows})
+    keep(asked, wp.get_device("cpu"), {"rows": rows}, len(present) == len(start_up.VARIANTS))
 
 
 def run_resources(asked: argparse.Namespace) -> None:

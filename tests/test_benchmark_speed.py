@@ -112,4 +112,9 @@ def test_start_up():
     row = start_up.one("box", "box_on_ground")
     assert row["modules"] > 0
     assert 0.0 < row["read_s"] < row["warm_s"] < row["cold_s"]
-    assert f"| box | {row['cold_s']:.1f} | {row['warm_s']:.2f} |" in start_up.markdown([row])
+    slower = {"scene": "box", "engine": "other", "cold_s": 2.0 * row["cold_s"], "warm_s": 1.0}
+    none = {"scene": "box", "engine": "none", "refused": "none: no boxes"}
+    _, _, ours, other, *refused = start_up.markdown([row, slower, none]).splitlines()
+    assert ours.startswith(f"| box | {row['engine']} | {row['cold_s']:.1f} | {row['warm_s']:.2f} |")
+    assert other.endswith("| - | - | 2.0 |")
+    assert "box: refused by none: no boxes" in refused

@@ -139,8 +139,8 @@ class Session:
 
 
 @contextmanager
-def session(peer: Peer, folder: Path) -> Iterator[Session]:
-    """Start a peer's adapter; its process ends with the context."""
+def session(peer: Peer, folder: Path, cache: Path | None = None) -> Iterator[Session]:
+    """Start a peer's adapter; its process ends with the context. cache: of kernels, if it is not the peer's own."""
     with tempfile.TemporaryDirectory() as work:
         with Path(work, "log.txt").open("w") as errors:
             process = subprocess.Popen(
@@ -149,7 +149,7 @@ def session(peer: Peer, folder: Path) -> Iterator[Session]:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
-                env=peer.environment(folder),
+                env=peer.environment(folder) | ({} if cache is None else {"WARP_CACHE_PATH": str(cache)}),
             )
         try:
             running = Session(peer, process, Path(work))
