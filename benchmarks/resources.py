@@ -7,10 +7,12 @@ driver, counts the entry points in the binaries and reads their resources with c
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -105,17 +107,20 @@ def measure(precision: str) -> list[Resources]:
     Raises:
         RuntimeError: where a binary does not hold exactly the one entry point that was asked for.
     """
-    table = []
-    with tempfile.TemporaryDirectory() as folder:
-        for name, kernel in kernels(precision).items():
+    program = cuobjdump()
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count()) as pool:
+
+        def one(name: str, kernel: wp.Kernel) -> Resources:
             (binary,) = wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=f"{folder}/{name}", use_ptx=False)
-            text = subprocess.run([cuobjdump(), "--dump-resource-usage", str(binary)], capture_output=True, text=True, check=True).stdout
+            text = subprocess.run([program, "--dump-resource-usage", str(binary)], capture_output=True, text=True, check=True).stdout
             entries = re.findall(r"Function (\S*_cuda_kernel_forward):\s+(.*)", text)
             if len(entries) != 1:
                 raise RuntimeError(f"{name} ({precision}): {len(entries)} entry points in its binary instead of 1")
             use = {key: int(value) for key, value in re.findall(r"([A-Z]+):(\d+)", entries[0][1])}
-            table.append(Resources(name, precision, use["REG"], use["STACK"], use["LOCAL"], use["SHARED"]))
-    return table
+            return Resources(name, precision, use["REG"], use["STACK"], use["LOCAL"], use["SHARED"])
+
+        found = kernels(precision)
+        return list(pool.map(one, found, found.values()))
 
 
 def markdown(table: list[Resources]) -> str:
