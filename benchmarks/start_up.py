@@ -72,7 +72,7 @@ def other(name: str, path: Path, peer: Peer, folder: Path) -> dict[str, Any]:
 def measure(others: list[Peer], folder: Path, usd: Path = robots.USD) -> list[dict[str, Any]]:
     """Shipped scenes, and robots made by others where their files are, those beside other engines."""
     paths: dict[str, str | Path] = {name: name for name in SHIPPED}
-    made = {name: usd / file for name, file in FILES.items() if (usd / file).exists()}
+    made = {Path(file).stem: usd / file for file in FILES.values() if (usd / file).exists()}
     rows = []
     for name, path in tqdm((paths | made).items(), desc="start-up", disable=None):
         rows.append(one(name, path))
