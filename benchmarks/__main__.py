@@ -131,6 +131,7 @@ def arguments(words: list[str] | None = None) -> argparse.Namespace:
         run_start_up,
         "from a fresh process to the first step of robots and others, with an empty cache and a full one (CPU)",
         out,
+        quick,
         place,
     )
     sub.add_argument(
@@ -378,9 +379,9 @@ def run_start_up(asked: argparse.Namespace) -> None:
     present, absent = peers.split(asked.peers, asked.dir)
     if absent:
         print(absent)
-    rows = start_up.measure(present, asked.dir)
-    print(start_up.markdown(rows))
-    keep(asked, wp.get_device("cpu"), {"rows": rows}, len(present) == len(start_up.VARIANTS))
+    data = start_up.measure(present, asked.dir, asked.quick)
+    print(start_up.markdown(data["rows"]))
+    keep(asked, wp.get_device("cpu"), data, len(present) == len(start_up.VARIANTS) and not data["absent"])
 
 
 def run_resources(asked: argparse.Namespace) -> None:
@@ -410,7 +411,7 @@ def run_regression(asked: argparse.Namespace) -> None:
 def run_all(asked: argparse.Namespace) -> None:
     for name in EVERYTHING:
         print(f"\n# {name}\n", flush=True)
-        takes_quick = name not in ("start-up", "robust", "resources")
+        takes_quick = name not in ("robust", "resources")
         again = arguments([name, *(["--quick"] if asked.quick and takes_quick else [])])
         again.run(again)
 

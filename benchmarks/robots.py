@@ -125,10 +125,10 @@ def load(path: Path) -> wl.Model:
     Raises:
         wl.SceneError: where the file cannot be simulated.
     """
-    model = wl.load_usd(path)
+    reading = read_usd(path)
+    model = reading.builder.finalize(reading.report)
     if wl.ShapeType.PLANE in model.shape_type:
         return model
-    reading = read_usd(path)
     reading.builder.add_plane(name="ground", material=wl.Material(*model.friction.max(axis=0).tolist()))
     return reading.builder.finalize(reading.report)
 

@@ -148,8 +148,7 @@ def make(real):
         stride: int,
     ):
         start, _ = wp.tid()
-        sides = int(2)  # as variables: Warp would write out the loops below, which makes twice the code of them
-        axes = int(3)
+        sides = int(2)  # as a variable: Warp would write out the loops over them, which makes twice the code
         for env in range(start, contacts.count.shape[0], stride):
             n = contacts.count[env]
             trees.touching[env] = n
@@ -210,8 +209,7 @@ def make(real):
                         if kind == CLOSER:
                             away = real(1.0)
                         along = apart * (away / wp.max(distance, real(1.0e-9)))
-                        for c in range(axes):
-                            frame[0, c] = along[c]
+                        frame[0] = along
                         phi[0] = away * (distance - trees.row_limit[k])
                     # Velocities of b relative to a there, present and free.
                     u = vec3()
@@ -283,13 +281,12 @@ def make(real):
                             eps[2] = real(FRICTION_RELAXATION) * w[2]
                         bound = vec2(h * drive[2] / length, h * friction / length)
                     elif not stops:
-                        for r in range(axes):
+                        for r in range(3):
                             if w[r] > real(IMMOBILE) * alone:
                                 eps[r] = loop_relaxation * w[r]
                                 shift[r] = wp.clamp(phi[r] / h, -real(MAX_CORRECTION), real(MAX_CORRECTION))
                             else:
-                                for c in range(axes):
-                                    frame[r, c] = real(0.0)
+                                frame[r] = vec3()
                                 w[r] = real(0.0)
                                 free[r] = real(0.0)
                     state = int(0)

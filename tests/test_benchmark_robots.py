@@ -12,7 +12,7 @@ from test_benchmarks import fake, folder  # noqa: F401
 from test_joints import moved, pendulum, poses, quadruped, random_state, random_tree
 
 import warp_lcp as wl
-from benchmarks import dynamics, motion, peers, regression, robot_speed, robots
+from benchmarks import dynamics, motion, peers, regression, robot_speed, robots, start_up
 from benchmarks.cases import CASES
 from benchmarks.peers import compare
 from benchmarks.peers.session import session
@@ -313,6 +313,15 @@ def test_a_peer_that_refuses_a_robot(folder, monkeypatch):  # noqa: F811
     slower = mine | {"engine": "x", "ours_over_peer": 0.5, "ours_over_peer_range": [0.4, 0.6]}
     faster = slower | {"ours_over_peer": 1.0, "ours_over_peer_range": [0.9, 1.1]}
     assert len(regression.worse({"what": "robots", "peers": [faster]}, {"what": "robots", "peers": [slower]})) == 1
+
+
+def test_start_up_of_a_peer(folder, monkeypatch):  # noqa: F811
+    """Two processes with a robot; what refuses it or ends on the way is told."""
+    monkeypatch.setitem(robot_speed.VARIANTS, "fake", ("plain",))
+    row = start_up.other(standing(), fake(folder), folder)
+    assert (row["scene"], row["engine"]) == ("quadruped", "fake, plain")
+    assert min(row["cold_s"], row["warm_s"]) > 0.0
+    assert start_up.other(standing(), fake(folder, fault="refuses"), folder)["refused"] == "fake, plain: no such thing"
 
 
 @pytest.mark.parametrize(
