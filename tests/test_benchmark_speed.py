@@ -94,7 +94,10 @@ def test_sources_say_what_kernels_touch(make):
 
 
 def test_floor_of_a_step():
-    """Of the box at rest: every launch has bytes and a time, and no launch is faster than its floor."""
+    """Of the box at rest: every launch has bytes, flops and a time, and floors of a step are those of its launches.
+
+    That a step takes longer than its floors is for `benchmarks speed` to tell: rates measured on a busy machine are no bound.
+    """
     data = step_floor.measure(quick=True)
     *launches, total, step = data["rows"]
     assert data["contacts"] == 4.0
@@ -103,7 +106,9 @@ def test_floor_of_a_step():
         assert row["written_bytes"] > 0.0
         assert row["flops"] > 0.0
     assert total["read_bytes"] == sum(row["read_bytes"] for row in launches)
-    assert step["ns"] > max(step["memory_floor_ns"], step["arithmetic_floor_ns"])
+    assert step["ns"] > 0.0
+    for floor in ("memory_floor_ns", "arithmetic_floor_ns"):
+        assert 0.0 < step[floor] == pytest.approx(sum(row[floor] for row in launches), rel=1e-12)
     assert f"| {launches[0]['kernel']} |" in step_floor.markdown(data)
 
 
