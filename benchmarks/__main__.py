@@ -380,7 +380,7 @@ def run_start_up(asked: argparse.Namespace) -> None:
     if absent:
         print(absent)
     data = start_up.measure(present, asked.dir, asked.quick)
-    print(start_up.markdown(data["rows"]))
+    print("\n".join([start_up.markdown(data["rows"]), *(f"left out, not there: {path}" for path in data["absent"])]))
     keep(asked, wp.get_device("cpu"), data, len(present) == len(start_up.VARIANTS) and not data["absent"])
 
 
