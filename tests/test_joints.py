@@ -505,6 +505,30 @@ def test_dry_friction_of_a_joint():
     assert abs(sim.v.numpy()[0, 0]) < 1e-8
 
 
+def test_mobility_of_rows_of_a_velocity():
+    """w of limits, drives and dry friction is scale^2 (M^-1)_ii: what relaxes them, and what weighs their impulses.
+
+    Other methods find the answer where it is wrong, so that no motion shows it. To 1e-12: two ways to the same number, cond M below 1e3.
+    """
+    builder = wl.ModelBuilder(gravity=(0, 0, 0))
+    parent, frame = -1, (0, 0, 0, *ABOUT_Z)
+    for k in range(3):
+        body = builder.add_body(pose=(k + 1.0, 0, 0, 0, 0, 0, 1), mass=1.0 + k, inertia=0.1 * np.eye(3))
+        parts = {"limit": (0.0, 1.0), "drive": Drive(10.0, 1.0, 5.0), "friction": 0.1, "armature": 0.2}
+        builder.add_joint(JointType.REVOLUTE, parent, body, parent_frame=frame, child_frame=(-1, *frame[1:]), **parts)
+        parent = body
+    sim = simulator(builder.finalize(), dt=1e-3)
+    mass = sim.mass_matrix().numpy()[0]
+    assert np.linalg.cond(mass) < 1e3
+    mobility = np.linalg.inv(mass).diagonal()
+    sim.step()
+    assert sim.rows.count.numpy()[0] == 3  # rows of the upper limits have nothing to do
+    scale = sim.mechanics.row_scale.numpy()[0]
+    scale = scale[scale[:, 0] != 0.0]
+    assert (scale > 0.0).all()
+    np.testing.assert_allclose(sim.rows.inv_mass.numpy()[0, :3], scale**2 * mobility[:, None], rtol=1e-12)
+
+
 def test_damping_is_implicit():
     """v dies at exp(-d t / m), to first order of the step; a damper that is far stiffer than the step stops it and no more."""
     sim = simulator(slider(damping=2.0), dt=1e-3)
