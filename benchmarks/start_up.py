@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a fresh process to the first step: with a kernel cache that is empty, and with the one that this run has filled (CPU).
 
-Robots beside other engines, one after the other on the same cores: machines differ by more than engines do.
+Robots beside other engines, one after the other on the same cores, and beside a kernel of Warp that does nothing: machines differ by more
+than engines do.
 """
 
 from __future__ import annotations
@@ -24,6 +25,21 @@ from .report import ROOT
 from .robot_speed import DT, FILES, VARIANTS
 from .robots import Robot
 
+WARP = "Warp"
+# The measure of a machine: import of Warp, its headers and its compiler.
+NOTHING = """
+import warp as wp
+wp.config.log_level = wp.LOG_WARNING
+
+@wp.kernel(enable_backward=False)
+def nothing(x: wp.array(dtype=float)):
+    x[wp.tid()] = 1.0
+
+x = wp.empty(1, dtype=float, device="cpu")
+wp.launch(nothing, dim=1, inputs=[x], device="cpu")
+x.numpy()
+print("first step:", flush=True)
+"""
 SHIPPED = ("box_on_ground", "stack", "quadruped", "humanoid")
 CODE = """
 import sys, time
@@ -46,28 +62,36 @@ print("first step:", read, len(list(Path(wp.config.kernel_cache_dir).glob("wp_*"
 """
 
 
-def one(name: str, scene: str | Path) -> dict[str, Any]:
-    """Seconds of two processes, from their start to the end of the first step, and of import and reading of the USD file in the second.
-
-    A file that has no ground gets one (robots.load), as other engines are given.
-    """
-    row: dict[str, Any] = {"scene": name, "engine": OURS}
-    with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"WARP_CACHE_PATH": cache, "PYTHONPATH": str(ROOT)}
+def timed(code: str, *arguments: str) -> tuple[dict[str, float], list[str]]:
+    """Seconds of two processes, from their start until they tell of their first step, and what the second tells."""
+    seconds: dict[str, float] = {}
+    told: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"WARP_CACHE_PATH": str(Path(folder) / "cache"), "PYTHONPATH": str(ROOT)}
         environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python keeps it by default, and then has it in the second process
+        program = Path(folder) / "first_step.py"  # Warp reads the source of kernels
+        program.write_text(code)
+        command = [sys.executable, str(program), *arguments]
         for state in ("cold", "warm"):
             begin = time.perf_counter()
-            command = [sys.executable, "-c", CODE, str(scene)]
             with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
                 assert process.stdout is not None
                 for line in process.stdout:
                     if line.startswith("first step:"):
-                        row[f"{state}_s"] = time.perf_counter() - begin
-                        read, modules = line.split()[-2:]
-                        row |= {"read_s": float(read), "modules": int(modules)}
+                        seconds[f"{state}_s"] = time.perf_counter() - begin
+                        told = line.split()[2:]
             if process.returncode != 0:
                 raise subprocess.CalledProcessError(process.returncode, command)
-    return row
+    return seconds, told
+
+
+def one(name: str, scene: str | Path) -> dict[str, Any]:
+    """Start-up of ours, and of it import and reading of the USD file with a full cache.
+
+    A file that has no ground gets one (robots.load), as other engines are given.
+    """
+    seconds, (read, modules) = timed(CODE, str(scene))
+    return {"scene": name, "engine": OURS, **seconds, "read_s": float(read), "modules": int(modules)}
 
 
 def other(robot: Robot, peer: Peer, folder: Path) -> dict[str, Any]:
@@ -94,7 +118,7 @@ def measure(others: list[Peer], folder: Path, quick: bool, usd: Path = robots.US
     made = {Path(file).stem: usd / file for file in FILES.values()}
     absent = [str(path) for path in made.values() if not path.exists()]
     paths: dict[str, str | Path] = {name: name for name in SHIPPED} | {name: path for name, path in made.items() if path.exists()}
-    rows = []
+    rows: list[dict[str, Any]] = [{"scene": "nothing", "engine": WARP, **timed(NOTHING)[0]}]
     for name, path in tqdm(list(paths.items())[: 1 if quick else None], desc="start-up", disable=None):
         rows.append(one(name, path))
         if name in made and others:
@@ -105,12 +129,15 @@ def measure(others: list[Peer], folder: Path, quick: bool, usd: Path = robots.US
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """One line a scene and engine."""
-    lines = ["| scene | engine | cold s | warm s | of which import and USD | modules compiled | cold, its / ours |", "|" + " --- |" * 7]
+    lines = ["| scene | engine | cold s | warm s | of which import and USD | modules compiled | cold, its / ours | cold, its / nothing's |"]
+    lines.append("|" + " --- |" * 8)
     ours = {r["scene"]: r["cold_s"] for r in rows if r["engine"] == OURS}
+    least = next(r["cold_s"] for r in rows if r["engine"] == WARP)
     for r in rows:
         if "refused" not in r:
             own = f"{r['read_s']:.2f} | {r['modules']}" if "read_s" in r else "- | -"
-            times = f"{r['cold_s']:.1f} | {r['warm_s']:.2f} | {own} | {r['cold_s'] / ours[r['scene']]:.2g}"
+            of_ours = f"{r['cold_s'] / ours[r['scene']]:.2g}" if r["scene"] in ours else "-"
+            times = f"{r['cold_s']:.1f} | {r['warm_s']:.2f} | {own} | {of_ours} | {r['cold_s'] / least:.2g}"
             lines.append(f"| {r['scene']} | {r['engine']} | {times} |")
     lines += [f"\n{r['scene']}: refused by {r['refused']}" for r in rows if "refused" in r]
     return "\n".join(lines)

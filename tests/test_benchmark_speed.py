@@ -117,9 +117,12 @@ def test_start_up():
     row = start_up.one("box", "box_on_ground")
     assert row["modules"] > 0
     assert 0.0 < row["read_s"] < row["warm_s"] < row["cold_s"]
+    nothing = {"scene": "nothing", "engine": start_up.WARP, **start_up.timed(start_up.NOTHING)[0]}
+    assert 0.0 < nothing["warm_s"] < nothing["cold_s"] < row["cold_s"]  # it compiles one module, a box eleven
     slower = {"scene": "box", "engine": "other", "cold_s": 2.0 * row["cold_s"], "warm_s": 1.0}
     none = {"scene": "box", "engine": "none", "refused": "none: no boxes"}
-    _, _, ours, other, *refused = start_up.markdown([row, slower, none]).splitlines()
+    _, _, least, ours, other, *refused = start_up.markdown([nothing, row, slower, none]).splitlines()
+    assert least.endswith("| - | - | - | 1 |")
     assert ours.startswith(f"| box | {row['engine']} | {row['cold_s']:.1f} | {row['warm_s']:.2f} |")
-    assert other.endswith("| - | - | 2 |")
+    assert other.endswith(f"| - | - | 2 | {2.0 * row['cold_s'] / nothing['cold_s']:.2g} |")
     assert "box: refused by none: no boxes" in refused
