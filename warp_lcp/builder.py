@@ -150,6 +150,12 @@ class ModelBuilder:
         )
         return len(self._bodies) - 1
 
+    def add_carrier(self, name: str, of: int) -> int:
+        """Add a body without mass between joints that move `of` one after the other, a part of it (`Model.part_of`); returns its index."""
+        body = self.add_body(name, pose=self.pose(of), mass=0.0)
+        self._bodies[body].part_of = of
+        return body
+
     def add_joint(
         self,
         type: JointType,

@@ -222,8 +222,7 @@ class JointReader:
         for k, (part, centre) in enumerate(parts):
             child = ends[1]
             if k + 1 < len(parts):  # it stands where the second body does, and moves with what comes before it
-                child = reader.builder.add_body(f"{part[-1].name}:carried", pose=reader.builder.pose(ends[1]), mass=0.0)
-                reader.builder._bodies[child].part_of = ends[1]
+                child = reader.builder.add_carrier(f"{part[-1].name}:carried", ends[1])
             frame = np.r_[centre, part[0].frame[3:]]
             frames = [compose(inverse(parent_pose), frame), compose(inverse(where), frame)]
             options: dict[str, Any] = {"name": part[0].name, "parent_frame": frames[0], "child_frame": frames[1], "collide": collide}
