@@ -177,7 +177,8 @@ def make(real, trees: bool = False):
                         contacts.directions[env, i],
                     )
                     worst = wp.max(worst, wp.max(wp.abs(error)))
-                    finite = finite and wp.isfinite(error)  # a maximum passes over what is not a number
+                    # A maximum passes over what is not a number, and so does an impulse that is bounded: u is all that tells of a target.
+                    finite = finite and wp.isfinite(error) and wp.isfinite(u)
                     energy += part
                     contacts.velocity[env, i] = ended
                     contacts.state[env, i] = state

@@ -271,6 +271,28 @@ def test_out_is_what_a_simulator_does(tmp_path, capsys, every):
                 np.testing.assert_array_equal(rows[name][k], getattr(sim, name).numpy())
 
 
+def test_out_of_a_mechanism_has_its_coordinates(tmp_path, capsys):
+    """By joint, and the summary says how far its loop is open; a scene without joints has none of it."""
+    path = tmp_path / "run.npz"
+    facts = summary(capsys, "fourbar", "--envs", 2, "--dt", 0.002, "--duration", 0.1, "--out", path)
+    model = wl.load_usd("fourbar")
+    sim = wl.Simulator(model, 2, 0.002, device="cpu")
+    with np.load(path) as rows:
+        assert rows["dof_names"].tolist() == list(model.dof_names)
+        for k in range(51):
+            if k:
+                sim.step()
+            np.testing.assert_array_equal(rows["q"][k], sim.q.numpy())
+            np.testing.assert_array_equal(rows["v"][k], sim.v.numpy())
+    assert facts["loops_open"] == dict(zip(("m", "rad"), sim.loop_gaps().max(axis=(0, 1)), strict=True))
+    assert 0.0 < facts["loops_open"]["m"] < 1e-4
+    run("fourbar", "--dt", 0.002, "--duration", 0.1)
+    assert "loops, most open" in capsys.readouterr().out
+    assert summary(capsys, "box_on_ground", "--duration", 0.01, "--out", path)["loops_open"] is None
+    with np.load(path) as rows:
+        assert "q" not in rows
+
+
 def test_summary_counts_every_step(capsys):
     facts = summary(capsys, "box_on_ground", "--envs", 3, "--dt", 0.002, "--duration", 0.5)
     sim = wl.Simulator(wl.load_usd("box_on_ground"), 3, 0.002, device="cpu")

@@ -2,9 +2,11 @@
 """Mechanisms and robots: the shipped scenes with joints, and loops that hold more than they need, against closed forms, integrations in
 minimal coordinates and converged runs."""
 
+import re
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -660,3 +662,18 @@ def test_what_is_hit_keeps_its_momentum():
         levels = (push * velocity[..., :3]).sum(axis=(2, 3)) + np.einsum("tebi,bij,tebj->te", spin, model.inertia, spin)
         assert (levels[-1] < 0.9 * levels[0]).all()  # all were hit
         assert np.diff(levels, axis=0).max() < 5e-3 * levels[0].max()
+
+
+def test_the_document_on_robots_runs():
+    """docs/robots.md from top to bottom; in the environment that nothing pushes the drive then holds the shoulder against its weight."""
+    source = (Path(__file__).parents[1] / "docs" / "robots.md").read_text(encoding="utf-8")
+    scope: dict = {}
+    exec("\n".join(re.findall(r"```python\n(.*?)```", source, re.DOTALL)), scope)
+    model, sim, shoulder = scope["model"], scope["sim"], scope["model"].velocities("shoulder")
+    assert not model.report.notes
+    assert sim.q.numpy()[1] == pytest.approx(model.q0)  # which was reset
+    sim.step(2000)
+    assert not sim.status.numpy().any()
+    torque = 200.0 * (0.5 - sim.q.numpy()[0, model.coordinates("shoulder")])
+    assert abs(torque[0]) > 5.0
+    assert torque == pytest.approx(sim.bias().numpy()[0, shoulder], rel=1e-6)  # what is left of the swing falls by e in 0.15 s

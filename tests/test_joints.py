@@ -640,7 +640,16 @@ def test_joints_that_are_none():
         ({"type": JointType.REVOLUTE, "parent": -1, "child": body, "axes": ("rx",)}, "are for D6"),
         ({"type": JointType.REVOLUTE, "parent": -1, "child": body, "limit": (1.0, -1.0)}, "leaves no room"),
         ({"type": JointType.REVOLUTE, "parent": -1, "child": body, "damping": -1.0}, "not negative"),
-        ({"type": JointType.REVOLUTE, "parent": -1, "child": body, "drive": Drive(-1.0)}, "must not be negative"),
+        (
+            {"type": JointType.REVOLUTE, "parent": -1, "child": body, "drive": Drive(-1.0)},
+            "stiffness of its drive is -1; it must be finite and not",
+        ),
+        ({"type": JointType.REVOLUTE, "parent": -1, "child": body, "drive": Drive(1.0, 1.0, np.nan)}, "max_force of its drive is nan"),
+        (
+            {"type": "revolute", "parent": -1, "child": body},
+            "'revolute' is no type of joint; give one of JointType.FIXED, JointType.REVOLUTE",
+        ),
+        ({"type": JointType.REVOLUTE, "parent": -1, "child": "a"}, "body 'a' does not exist; add_body returns the index"),
         ({"type": JointType.SPHERICAL, "parent": -1, "child": body, "limit": [(-1, 1)] * 3}, "no angles to limit"),
     ]
     for options, message in cases:
@@ -648,6 +657,103 @@ def test_joints_that_are_none():
             builder.add_joint(**options)
     with pytest.raises(wl.WarpLcpError, match="no range"):
         builder.add_distance(-1, body, 2.0, 1.0)
+    builder.add_joint(JointType.REVOLUTE, -1, body, name="hip")
+    with pytest.raises(wl.WarpLcpError, match="hip: a joint of this name exists already"):
+        builder.add_joint(JointType.REVOLUTE, -1, body, name="hip")
+
+
+def test_a_start_beyond_a_limit_is_told():
+    builder = slider()
+    arm = builder.add_body("arm", mass=1.0, inertia=SMALL)
+    builder.add_joint(JointType.REVOLUTE, 0, arm, limit=(-0.1, 0.1), start=1.0, name="elbow")
+    (told,) = builder.finalize().report.notes
+    assert told == "elbow (at 1, limits -0.1 .. 0.1): starts beyond its limits, which push it back at once"
+
+
+# ------------------------------------------------------------------------------------------------- names, and what is written
+
+
+def arm_and_ball() -> wl.Model:
+    """A free body, a ball joint on it, and a joint with three axes of which two have names of their own."""
+    builder = wl.ModelBuilder()
+    for name in ("base", "upper", "lower"):
+        builder.add_body(name, mass=1.0, inertia=SMALL)
+    builder.add_joint(JointType.SPHERICAL, 0, 1, name="/robot/left/shoulder")
+    builder.add_joint(JointType.D6, 1, 2, axes=("tx", "ry", "rz"), name="/robot/left/wrist", axis_names=("/r/out", "/r/flex", "/l/flex"))
+    return builder.finalize()
+
+
+def test_joints_by_name():
+    """Each name moves the coordinates that it says, and no others."""
+    model = arm_and_ball()
+    found = {
+        name: (model.coordinates(name), model.velocities(name)) for name in ("base", "shoulder", "/robot/left/wrist", "out", "/l/flex")
+    }
+    assert found == {
+        "base": (slice(0, 7), slice(0, 6)),
+        "shoulder": (slice(7, 11), slice(6, 9)),
+        "/robot/left/wrist": (slice(11, 14), slice(9, 12)),
+        "out": (slice(11, 12), slice(9, 10)),
+        "/l/flex": (slice(13, 14), slice(11, 12)),
+    }
+    sim = wl.Simulator(model, dt=1e-3, device=DEVICE)
+    for name in ("shoulder", "out", "/l/flex"):
+        q, v = found[name]
+        sim.reset()
+        sim.v.assign(np.eye(model.nv)[v.start][None])
+        sim.step()
+        changed = np.flatnonzero(np.abs(sim.q.numpy()[0] - model.q0) > 1e-4)
+        assert set(changed) <= set(range(q.start, q.stop))
+        assert len(changed) == 1
+    for name, message in (
+        ("flex", "flex: there are /r/flex, /l/flex; give one of them"),
+        ("shulder", "did you mean /robot/left/shoulder"),
+        ("x", "there are base, "),
+    ):
+        with pytest.raises(wl.ModelError, match=message):
+            model.velocities(name)
+
+
+def test_shapes_of_contacts():
+    """Two spheres on one body: which of them touches?"""
+    builder = wl.ModelBuilder()
+    ground = builder.add_plane()
+    body = builder.add_body(pose=(0, 0, 0.1, 0, 0, 0, 1))
+    builder.add_sphere(body, 0.1, pose=(0, 0, 0.5, 0, 0, 0, 1))
+    low = builder.add_sphere(body, 0.1)
+    sim = simulator(builder, dt=1e-3)
+    sim.step()
+    assert sim.contacts.count.numpy()[0] == 1
+    assert sim.model.slot_shapes[sim.contacts.slot.numpy()[0, 0]].tolist() == [ground, low]
+
+
+def test_control_is_checked_where_it_is_set():
+    builder = slider(drive=Drive(100.0, 10.0))
+    sim = simulator(builder, num_envs=3, dt=1e-3)
+    sim.set_control(position=[0.25], force=np.array([[1.0], [2.0], [3.0]]))
+    assert sim.control.position.numpy().tolist() == [[0.25]] * 3
+    assert sim.control.force.numpy().tolist() == [[1.0], [2.0], [3.0]]
+    sim.set_control(force=0.5)
+    assert sim.control.force.numpy().tolist() == [[0.5]] * 3
+    for values, message in (
+        ({"position": [1.0, 2.0]}, r"position has shape \(2,\); give \(1,\) or \(3, 1\)"),
+        ({"position": [np.nan]}, "position.* is nan; it must be finite"),
+        ({"torque": [1.0]}, "'torque' is nothing of it; choose from position, velocity, force"),
+    ):
+        with pytest.raises(wl.WarpLcpError, match=message):
+            sim.set_control(**values)
+    with pytest.raises(wl.WarpLcpError, match="the model has none"):
+        simulator(paper_box(), dt=1e-3).set_control(position=0.0)
+
+
+@pytest.mark.parametrize("field", ["position", "velocity"])
+@pytest.mark.parametrize("most", [5.0, np.inf])
+def test_a_target_that_is_no_number_is_flagged(field, most):
+    """Also where the force of the drive is limited, to which a comparison would cut what is not a number."""
+    sim = simulator(slider(drive=Drive(100.0, 10.0, most)), num_envs=2, dt=1e-3)
+    getattr(sim.control, field).assign(np.array([[np.nan], [0.0]]))
+    sim.step()
+    assert sim.status.numpy().tolist() == [wl.Status.NOT_A_NUMBER, 0]
 
 
 def test_bodies_that_hang_rigidly_on_each_other_are_as_one_body_to_touch():

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from conftest import GRAVITY, simulator
 from scipy.optimize import brentq
-from test_joint_scenes import hinge, openings, rod
+from test_joint_scenes import ALONG, hinge, openings, rod
 from test_usd import JOINT, SCENE, layer, load
 from test_usd_joints import joint, pair
 
 import warp_lcp as wl
 from warp_lcp.cli import main
+from warp_lcp.joints import about, multiply
 from warp_lcp.model import Drive, JointType
 
 pytest.importorskip("pxr", reason="needs the extra 'usd'")
@@ -325,3 +326,61 @@ def test_boxes_fourbar_of_kamino(shared):
     first, second, third, fourth = (angles[f"/boxes_fourbar/Joints/joint_{k}"] for k in (1, 2, 3, 4))
     assert np.abs([first, second, third, fourth]).max() < np.radians(45) + 1e-6
     assert np.abs(first + second + third + fourth).max() < 1e-5
+
+
+# ------------------------------------------------------------------------------------------------- loops that are open
+
+
+def chain_between(gap: np.ndarray, axis: str = "y", **options) -> wl.ModelBuilder:
+    """Two links of 0.5 m from a hinge on the world, in line along x; a hinge on the world, `gap` from their end, closes the loop."""
+    builder, ends = wl.ModelBuilder(gravity=(0, 0, 0)), np.array([[0.0, 0, 1], [0.5, 0, 1], [1.0, 0, 1]])
+    bodies = [rod(builder, ends[k], ends[k + 1], 1.0) for k in range(2)]
+    place = {body: ends[k : k + 2].mean(axis=0) for k, body in enumerate(bodies)}
+    hinge(builder, -1, bodies[0], ends[0], axis, place)
+    hinge(builder, *bodies, ends[1], axis, place)
+    frames = [(*(ends[2] + gap), *ALONG[axis]), (0.25, 0, 0, *ALONG[axis])]
+    builder.add_joint(JointType.REVOLUTE, -1, bodies[1], parent_frame=frames[0], child_frame=frames[1], loop=True, name="last", **options)
+    return builder
+
+
+@pytest.mark.parametrize("options", [{}, {"damping": 0.1}])
+@pytest.mark.parametrize(("gap", "stays"), [((0.5, 0, 0), 0.5), ((0, 0.3, 0), 0.3), ((-0.1, 0, 0), 0.0)])
+def test_a_loop_that_is_open_is_told(gap, stays, options):
+    """Too far along the chain, beside it, or within reach: then a second closes it. How far it is open is there to be asked for."""
+    builder = chain_between(np.array(gap), **options)
+    sim = simulator(builder, num_envs=2, dt=1e-3)
+    told = [note for note in sim.model.report.notes if "open at the start" in note]
+    assert len(told) == 1
+    assert told[0].startswith(f"last: a loop that is open at the start, by {np.linalg.norm(gap):.3g} m:")
+    assert sim.loop_gaps() == pytest.approx(np.broadcast_to([np.linalg.norm(gap), 0.0], (2, 1, 2)), abs=1e-12)
+    sim.v.assign(np.tile(np.array([0.1, -0.2] + [0.0] * (sim.model.nv - 2)), (2, 1)))  # away from the line, along which nothing pulls
+    sim.step(1000)
+    assert sim.loop_gaps()[..., 0].max() >= 0.999 * stays
+    if stays == 0.0:
+        assert sim.loop_gaps().max() < 1e-5
+
+
+def test_a_loop_that_is_closed_is_not_told():
+    assert not chain_between(np.zeros(3)).finalize().report.notes
+
+
+def test_a_distance_out_of_its_range_is_told():
+    builder = wl.ModelBuilder()
+    ball = builder.add_body(pose=(0, 0, 2, 0, 0, 0, 1), mass=1.0, inertia=np.eye(3))
+    builder.add_distance(-1, ball, 0.5, 1.5, name="rope")
+    model = builder.finalize()
+    assert model.report.notes[0].startswith("rope: a distance out of its range at the start, by 0.5 m:")
+    assert wl.Simulator(model, device="cpu").loop_gaps() == pytest.approx(np.array([[[0.5, 0.0]]]))
+
+
+@pytest.mark.parametrize(
+    ("axes", "turn", "expected"), [((), (0.3, 0, 0), 0.3), (("rx",), (0.3, 0.2, 0), 0.2), (("rx", "ry"), (0, 0, 0.4), 0.4)]
+)
+def test_how_far_a_loop_is_turned(axes, turn, expected):
+    """A weld by the angle of the rotation, a hinge by that between its axes, two free axes by what they lack of a right angle."""
+    builder = wl.ModelBuilder()
+    q = multiply(about(0, turn[0]), multiply(about(1, turn[1]), about(2, turn[2])))
+    builder.add_body(pose=(0, 0, 0, *q), mass=1.0, inertia=np.eye(3))
+    builder.add_joint(JointType.D6 if axes else JointType.FIXED, -1, 0, axes=axes or None, loop=True)
+    sim = wl.Simulator(builder.finalize(), device="cpu")
+    assert sim.loop_gaps()[0, 0] == pytest.approx([0.0, expected], abs=1e-12)

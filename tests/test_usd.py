@@ -227,6 +227,7 @@ def test_capsule_defaults_are_those_of_usd_and_a_density_counts():
     assert model.shape_size[0].tolist() == [0.5, 0.5, 0]
     assert model.mass == pytest.approx([500 * volume + 1000], rel=1e-6)
     assert model.com[0] == pytest.approx([3000 / (500 * volume + 1000), 0, 0], rel=1e-6)
+    assert "its axis is 'Q'; give one of X, Y, Z" in refused(body(inner=prim("Capsule", "C", (COLLIDER,), 'uniform token axis = "Q";')))
     assert "/B/C: capsule: half length is 0.0 m" in refused(body(inner=prim("Capsule", "C", (COLLIDER,), "double height = 0;")))
 
 

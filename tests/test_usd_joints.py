@@ -497,6 +497,57 @@ def test_joint_that_names_nothing_is_refused():
     assert "/J: physics:body0 names /Nope, which does not exist" in message
 
 
+def test_joint_that_names_what_stands_nowhere_is_refused():
+    message = refused(body("A", LIGHT, inner=""), joint("Revolute", "rel physics:body0 = </Scene>; rel physics:body1 = </A>;"))
+    assert "/J: physics:body0 names /Scene, which stands nowhere" in message
+
+
+@pytest.mark.parametrize("kind", ["Revolute", "Prismatic"])
+def test_axis_that_is_none(kind):
+    """The parser takes x for it."""
+    assert "/J: physics:axis is 'Q'; give one of X, Y, Z" in refused(*pair(kind, 'uniform token physics:axis = "Q";'))
+
+
+DRIVE = "float drive:{0}:physics:stiffness = 10; float drive:{0}:physics:damping = 1;"
+
+
+@pytest.mark.parametrize(
+    ("kind", "content", "apis", "what", "why"),
+    [
+        ("Revolute", DRIVE.format("linear"), ["PhysicsDriveAPI:linear"], "PhysicsDriveAPI:linear", "takes angular alone"),
+        ("Prismatic", DRIVE.format("angular"), ["PhysicsDriveAPI:angular"], "PhysicsDriveAPI:angular", "takes linear alone"),
+        ("Spherical", DRIVE.format("rotX"), ["PhysicsDriveAPI:rotX"], "PhysicsDriveAPI:rotX", "takes none"),
+        ("Revolute", "float limit:rotX:physics:low = -10;", ["PhysicsLimitAPI:rotX"], "PhysicsLimitAPI:rotX", "takes none"),
+        (
+            "Revolute",
+            DRIVE.format("angular"),
+            [],
+            "drive:angular:physics:damping, drive:angular:physics:stiffness",
+            "no PhysicsDriveAPI is",
+        ),
+        ("", limit("transX", 1, -1) + DRIVE.format("transX"), ["PhysicsLimitAPI:transX", "PhysicsDriveAPI:transX"], None, "is locked"),
+    ],
+)
+def test_what_acts_along_an_axis_that_the_joint_has_not_is_told(kind, content, apis, what, why):
+    model = load(*pair(kind, content, apis))
+    (told,) = [i for i in model.report.ignored if why in i.why]
+    assert (told.path, told.what) == ("/J", what or "PhysicsDriveAPI:transX")
+    assert not model.drive[6:, :2].any()
+
+
+def test_a_rotation_of_no_length_is_told():
+    model = load(*pair("Revolute", "quatf physics:localRot1 = (0, 0, 0, 0);"))
+    assert "/J: physics:localRot1 is zero, which is no rotation; (1, 0, 0, 0) is taken" in model.report.notes
+
+
+@pytest.mark.parametrize(("name", "value"), [("stiffness", "-10"), ("damping", "nan"), ("maxForce", "-1")])
+def test_drive_that_is_none_is_refused_as_it_was_written(name, value):
+    numbers = {"stiffness": "10", "damping": "1", "maxForce": "5"} | {name: value}
+    content = "".join(f"float drive:angular:physics:{k} = {x};" for k, x in numbers.items())
+    message = refused(*pair("Revolute", content, ["PhysicsDriveAPI:angular"]))
+    assert f"/J: its drive's physics:{name} is {value}; give a finite number" in message
+
+
 def test_robots_of_instances_and_their_joints():
     """Two instances of one robot, 5 apart: each has bodies, joint and articulation of its own, which passes through itself alone."""
     arms = [body(n, LIGHT + xform(translate=f"({x}, 0, 0)"), inner=cube()) for n, x in (("A", 0), ("B", 1), ("C", 2))]

@@ -203,14 +203,19 @@ class ModelBuilder:
             ModelError: for a joint that is none, or a number that is not finite or negative.
         """
         name = f"joint{len(self._joints)}" if name is None else name
+        if any(joint.name == name for joint in self._joints):
+            raise ModelError(f"{name}: a joint of this name exists already; give each joint its own name")
         for body in (parent, child):
-            if not -1 <= body < len(self._bodies):
-                raise ModelError(f"{name}: body {body} does not exist; add_body returns the index to give here")
+            if not isinstance(body, (int, np.integer)) or not -1 <= body < len(self._bodies):
+                raise ModelError(f"{name}: body {body!r} does not exist; add_body returns the index to give here")
         if parent == child:
             raise ModelError(f"{name}: it joins {'the world' if parent < 0 else self._bodies[parent].name} to itself; give two bodies")
-        type = JointType(type)
         if type in (JointType.FREE, JointType.KINEMATIC):
-            raise ModelError(f"{name}: {type.name} is no joint between bodies; say so in add_body")
+            raise ModelError(f"{name}: {JointType(type).name} is no joint between bodies; say so in add_body")
+        if type not in tuple(JointType):
+            known = ", ".join(f"JointType.{t.name}" for t in JointType if t not in (JointType.FREE, JointType.KINEMATIC))
+            raise ModelError(f"{name}: {type!r} is no type of joint; give one of {known}")
+        type = JointType(type)
         directions = None
         if type is JointType.D6:
             free, directions = _axes(name, tuple(axes or ()))
@@ -480,7 +485,8 @@ class ModelBuilder:
             mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
         elif body.joint is JointType.FREE:
             if body.mass is None or body.inertia is None:
-                raise ModelError(f"{body.name}: mass is unknown, the body has no shape; give it mass and inertia, or a shape")
+                missing = "mass" if body.mass is None else "inertia"
+                raise ModelError(f"{body.name}: {missing} is unknown, the body has no shape; give it mass and inertia, or a shape")
             mass, com, inertia = body.mass, np.zeros(3), body.inertia
         else:
             mass, com, inertia = 1.0, np.zeros(3), np.eye(3)  # never used: such a body does not answer to forces
@@ -579,8 +585,12 @@ def _drives(name: str, value: Drive | Sequence[Drive | None] | None, n: int) -> 
         raise ModelError(f"{name}: {len(drives)} drives; give {n}, one for each coordinate")
     table = np.array([NO_DRIVE if d is None else (d.stiffness, d.damping, d.max_force, d.target, d.target_velocity) for d in drives])
     table = table.reshape(n, 5)
-    if not ((table[:, :3] >= 0.0).all() and np.isfinite(table[:, [0, 1, 3, 4]]).all()):
-        raise ModelError(f"{name}: drive {table.tolist()}: gains and force must not be negative, and all but the force finite")
+    allowed = np.isfinite(table) | (table == np.inf) & (np.arange(5) == 2)
+    allowed[:, :3] &= table[:, :3] >= 0.0
+    for i, k in np.argwhere(~allowed):
+        what = ("stiffness", "damping", "max_force", "target", "target_velocity")[k]
+        rule = "finite" if k > 2 else "not negative" if k == 2 else "finite and not negative"
+        raise ModelError(f"{name}: {what} of its drive is {table[i, k]:g}; it must be {rule}")
     return table, np.array([d is not None and d.acceleration for d in drives], dtype=bool)
 
 

@@ -488,7 +488,15 @@ class Tally:
             "status": bits,
             "contacts_mean": float(np.mean(self.contacts)) if self.contacts else None,
             "iterations_mean": self.iterations / env_steps if env_steps else None,
+            "loops_open": self._loops_open(),
         }
+
+    def _loops_open(self) -> dict[str, float | None] | None:
+        """How far loops are open at the end, at most."""
+        if not self.sim.model.loops:
+            return None
+        way, turn = self.sim.loop_gaps().max(axis=(0, 1))
+        return {"m": _finite(way), "rad": _finite(turn)}
 
 
 class Recorder:
@@ -496,7 +504,7 @@ class Recorder:
 
     T rows, E environments, B bodies of the scene: time [T] s, pose [T, E, B, 7] (x y z qx qy qz qw), velocity [T, E, B, 6] (of the
     centre of mass, angular; world axes), status [T, E] and iterations [T, E] of all steps since the row before,
-    residual [T, E] m/s of the last of them.
+    residual [T, E] m/s of the last of them. With joints also q [T, E, nq] and v [T, E, nv].
     """
 
     def __init__(self, sim: Simulator, steps: int, every: int):
@@ -506,6 +514,8 @@ class Recorder:
         real = sim.residual.numpy().dtype
         layout = {"time": ((), np.dtype(float)), "pose": ((e, b, 7), real), "velocity": ((e, b, 6), real)}
         layout |= {"status": ((e,), np.dtype(np.int32)), "residual": ((e,), real), "iterations": ((e,), np.dtype(np.int32))}
+        if sim.model.articulated:
+            layout |= {"q": ((e, sim.model.nq), real), "v": ((e, sim.model.nv), real)}
         size = total * sum(math.prod(shape) * kind.itemsize for shape, kind in layout.values())
         too_large = WarpLcpError(f"--out takes {size / 1e9:.3g} GB of memory for {total} rows of {e} environments; give a larger --every")
         if size > _memory():
@@ -520,7 +530,7 @@ class Recorder:
         sim = self.sim
         row: dict[str, Any] = {"time": sim.time}
         row |= {"pose": sim.body_pose.numpy()[:, self.bodies], "velocity": sim.body_velocity.numpy()[:, self.bodies]}
-        row |= {name: getattr(sim, name).numpy() for name in ("status", "residual", "iterations")}
+        row |= {name: getattr(sim, name).numpy() for name in self.arrays if name in ("status", "residual", "iterations", "q", "v")}
         for name, value in row.items():
             self.arrays[name][self.rows] = value
         self.rows += 1
@@ -535,10 +545,13 @@ def _memory() -> float:
 
 
 def _save(path: Path, recorder: Recorder) -> None:
-    names = np.array(recorder.sim.model.body_names, dtype=np.str_)[recorder.bodies]
+    model = recorder.sim.model
+    names = {"body_names": np.array(model.body_names, dtype=np.str_)[recorder.bodies]}
+    if model.articulated:
+        names["dof_names"] = np.array(model.dof_names, dtype=np.str_)
     try:
         with path.open("wb") as file:
-            np.savez(file, body_names=names, **{name: a[: recorder.rows] for name, a in recorder.arrays.items()})  # type: ignore[arg-type]
+            np.savez(file, **names, **{name: a[: recorder.rows] for name, a in recorder.arrays.items()})  # type: ignore[arg-type]
     except OSError as error:
         raise WarpLcpError(f"--out {path}: cannot be written: {error.strerror}") from error
 
@@ -555,6 +568,9 @@ def _print_summary(facts: dict[str, Any]) -> None:
         "contacts, mean": _shown(facts["contacts_mean"]),
         "iterations, mean": f"{_shown(facts['iterations_mean'])} a step",
     }
+    if facts["loops_open"]:
+        way, turn = (_shown(facts["loops_open"][unit], f" {unit}") for unit in ("m", "rad"))
+        rows["loops, most open"] = f"{way}, {turn} at the end"
     rows |= {f"environments with {bit}": str(count) for bit, count in facts["status"].items() if count}
     rows |= {name: facts[name] for name in ("out", "rerun") if facts[name]}
     console.print(_table("interrupted" if facts["interrupted"] else "", ("", ""), rows.items()))

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from . import joints as geometry
 from .errors import ModelError
 from .joints import AXES, Joint, acts, columns, compose, coordinates, directions, inverse, kinds, mass_matrix, pose_of, rotate, turned
 from .model import DofKind, JointType, Loop, parents_first
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 NO_LIMIT, NO_DRIVE = (-np.inf, np.inf), (0.0, 0.0, np.inf, 0.0, 0.0)
-MOVED = 1e-5  # from here on it is told that a joint moves a body [m]
+MOVED = 1e-5  # from here on it is told that a joint moves a body, starts beyond a limit or is open [m, rad]
 
 
 @dataclass
@@ -166,6 +167,7 @@ class Arrangement:
         self.axes: list[np.ndarray] = []  # [6, n] of each body's velocities, at the world's origin
         self.by_inertia: list[int] = []  # drives that ask for accelerations
         self.moved: list[tuple[float, str]] = []  # what joints move at the start, by how much [m]
+        self.beyond: list[str] = []  # joints that start beyond their limits, and where
         self.carriers: dict[int, np.ndarray] = {}  # by which displacement a body is carried from where it was said to stand
         self.twists = np.zeros((count + 1, 6))  # velocity at the world's origin, angular velocity; the world's own is the last
         for b in self.order:
@@ -229,12 +231,16 @@ class Arrangement:
         self.poses[b] = compose(placed, inverse(joint.child_frame))
         if joint.start is None or part:  # the child's frame is the joint's: what turns there does not count as moved
             away = float(np.linalg.norm(placed[:3] - compose(asked, joint.child_frame)[:3]))
-            if away > MOVED:
+            if away > MOVED and not part:  # a part that is away leaves its loop open
                 self.moved.append((away, body.name))
         else:
             carrier = compose(self.poses[b], inverse(body.pose))
         if carrier is not None:
             self.carriers[b] = carrier
+        if joint.type is not JointType.SPHERICAL:
+            for k in np.flatnonzero((q < joint.limit[:, 0] - MOVED) | (q > joint.limit[:, 1] + MOVED)):
+                low, high = joint.limit[k]
+                self.beyond.append(f"{joint.names[k] if joint.names else joint.name} (at {q[k]:.4g}, limits {low:.4g} .. {high:.4g})")
         moves = columns(joint, frame, q)
         twist = self.twists[self.whole[b]] if part else self._asked_twist(b, self.poses[b])
         v = np.zeros(moves.shape[1])
@@ -265,6 +271,16 @@ class Arrangement:
         for body in self.bodies[self.given :]:
             name, of = body.name.removesuffix(":part"), self.bodies[body.part_of or 0].name
             found.append(f"{name}: closes a loop, and something acts along it: it carries a part of {of} that is welded to the rest")
+        if self.beyond:
+            rest = f" and {len(self.beyond) - 3} more" if len(self.beyond) > 3 else ""
+            found.append(f"{', '.join(self.beyond[:3])}{rest}: starts beyond its limits, which push it back at once")
+        for joint in self.loops:
+            way, turn = geometry.apart(loop_of(joint), self.poses)
+            if max(way, turn) > MOVED:
+                what = "a distance out of its range" if joint.distance is not None else "a loop that is open"
+                by = " and ".join(f"{x:.3g} {unit}" for x, unit in ((way, "m"), (turn, "rad")) if x > MOVED)
+                mend = "it is pulled there; where it cannot get there bodies are torn about: mend its frames, or where bodies stand"
+                found.append(f"{joint.name.removesuffix(':weld')}: {what} at the start, by {by}: {mend}")
         lost = [joint.name for joint in self.loops if joint.distance is None and acts(joint)]
         why = "closes a loop between bodies that forces do not move, or without mass: its limits, drives and the like are left out"
         return found + [f"{name}: {why}" for name in lost]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .errors import ModelError
-from .model import DofKind, JointType
+from .model import DofKind, JointType, Loop
 
 AXES = ("tx", "ty", "tz", "rx", "ry", "rz")
 SEARCH_ROUNDS = 100  # of coordinates nearest to a pose
@@ -50,28 +50,29 @@ class Joint:
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Product of quaternions (x y z w)."""
-    av, aw, bv, bw = a[:3], a[3], b[:3], b[3]
-    return np.r_[aw * bv + bw * av + np.cross(av, bv), aw * bw - av @ bv]
+    """Product of quaternions (x y z w), [..., 4] as all below."""
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    return np.concatenate([aw * bv + bw * av + np.cross(av, bv), aw * bw - (av * bv).sum(axis=-1, keepdims=True)], axis=-1)
 
 
 def conjugate(a: np.ndarray) -> np.ndarray:
-    return np.r_[-a[:3], a[3]]
+    return a * np.array([-1.0, -1.0, -1.0, 1.0])
 
 
 def rotate(a: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return x + 2.0 * np.cross(a[:3], np.cross(a[:3], x) + a[3] * x)
+    return x + 2.0 * np.cross(a[..., :3], np.cross(a[..., :3], x) + a[..., 3:] * x)
 
 
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Pose b in the frame of pose a."""
-    turn = multiply(a[3:], b[3:])
-    return np.r_[a[:3] + rotate(a[3:], b[:3]), turn / np.linalg.norm(turn)]
+    """Pose b in the frame of pose a, [..., 7]."""
+    turn = multiply(a[..., 3:], b[..., 3:])
+    place = a[..., :3] + rotate(a[..., 3:], b[..., :3])
+    return np.concatenate([place, turn / np.linalg.norm(turn, axis=-1, keepdims=True)], axis=-1)
 
 
 def inverse(a: np.ndarray) -> np.ndarray:
-    back = conjugate(a[3:])
-    return np.r_[-rotate(back, a[:3]), back]
+    back = conjugate(a[..., 3:])
+    return np.concatenate([-rotate(back, a[..., :3]), back], axis=-1)
 
 
 def about(axis: int | np.ndarray, angle: float) -> np.ndarray:
@@ -196,6 +197,32 @@ def mass_matrix(
     still = ~axes.any(axis=0)
     matrix[still, still] = 1.0
     return matrix
+
+
+def apart(loop: Loop, poses: np.ndarray) -> np.ndarray:
+    """How far the frames of a loop are from where it holds them, [..., 2] m and rad, with bodies at poses [..., B, 7].
+
+    A distance: how far it is out of its range.
+    """
+    ends = zip(loop.bodies, loop.frames, strict=True)
+    a, b = (compose(poses[..., body, :], frame) if body >= 0 else np.broadcast_to(frame, poses[..., 0, :].shape) for body, frame in ends)
+    if loop.distance is not None:
+        distance = np.linalg.norm(b[..., :3] - a[..., :3], axis=-1)
+        way = np.maximum(np.maximum(loop.distance[0] - distance, distance - loop.distance[1]), 0.0)
+        return np.stack([way, np.zeros_like(way)], axis=-1)
+    between = compose(inverse(a), b)
+    way = np.linalg.norm(between[..., :3] * loop.ways, axis=-1)
+    axes = np.stack([rotate(between[..., 3:], e) for e in np.eye(3)], axis=-1)  # of b in a: [..., i, k] coordinate i of axis k
+    free = [k for k in range(3) if not loop.turns[k]]
+    turn = np.zeros_like(way)
+    if len(free) == 0:
+        turn = 2.0 * np.arctan2(np.linalg.norm(between[..., 3:6], axis=-1), np.abs(between[..., 6]))
+    elif len(free) == 1:  # the axis that both turn about
+        along = axes[..., free[0], free[0]]
+        turn = np.arctan2(np.linalg.norm(np.delete(axes[..., free[0]], free[0], axis=-1), axis=-1), along)
+    elif len(free) == 2:  # of which the first is carried by a, the second by b: they stay perpendicular
+        turn = np.abs(np.arcsin(np.clip(axes[..., free[0], free[1]], -1.0, 1.0)))
+    return np.stack([way, turn], axis=-1)
 
 
 def acts(joint: Joint) -> bool:

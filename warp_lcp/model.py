@@ -27,11 +27,14 @@ The frame of a joint on its parent and that on its body coincide where q is zero
 
 from __future__ import annotations
 
+import difflib
 import enum
 import heapq
 from dataclasses import dataclass, field
 
 import numpy as np
+
+from .errors import ModelError
 
 
 class JointType(enum.IntEnum):
@@ -399,6 +402,52 @@ class Model:
                 if self.dof_kind[i] != DofKind.PRESCRIBED:
                     before[i], last[b] = last[b], i
         return before
+
+    def velocities(self, name: str) -> slice:
+        """Where the velocities of a joint stand in v, and in the columns of ``Simulator.control``; of one axis of several that have names.
+
+        Of a free or kinematic body by its own name. The last part of a prim's path is enough where it is unique.
+
+        Raises:
+            ModelError: for a name that none has, or several.
+        """
+        found = self._named(name)
+        return slice(found[0], found[-1] + 1)
+
+    def coordinates(self, name: str) -> slice:
+        """Where the coordinates of a joint stand in q: as many as velocities, 4 of a spherical joint, 7 of a free or kinematic body.
+
+        Raises:
+            ModelError: as :meth:`velocities` does.
+        """
+        found = self._named(name)
+        b = self.dof_body[found[0]]
+        if self.dof_kind[found[0]] in (DofKind.FREE, DofKind.PRESCRIBED, DofKind.BALL):
+            start, count = self.q_start[b], 4 if self.dof_kind[found[0]] == DofKind.BALL else 7
+        else:
+            start, count = self.q_start[b] + found[0] - self.v_start[b], len(found)
+        return slice(int(start), int(start) + count)
+
+    def _named(self, name: str) -> list[int]:
+        """Velocities of a joint, of an axis or of a body that no joint carries."""
+        known: dict[str, list[int]] = {}
+        for i, (own, b) in enumerate(zip(self.dof_names, self.dof_body, strict=True)):
+            for called in dict.fromkeys((own, self.joint_names[b] or own)):
+                known.setdefault(called, []).append(i)
+        fitting = [name] if name in known else [full for full in known if full.rpartition("/")[2] == name]
+        if len(fitting) == 1:
+            return known[fitting[0]]
+        if fitting:
+            raise ModelError(f"{name}: there are {', '.join(fitting[:3])}{' and others' if len(fitting) > 3 else ''}; give one of them")
+        short = {full.rpartition("/")[2]: full for full in known}
+        near = difflib.get_close_matches(name.rpartition("/")[2], short, n=3)
+        hint = f"did you mean {', '.join(short[x] for x in near)}?" if near else f"there are {', '.join(list(known)[:6])} ..."
+        raise ModelError(f"{name}: no joint and no free body has this name; {hint}")
+
+    @property
+    def slot_shapes(self) -> np.ndarray:
+        """[C, 2] shapes a and b of each contact slot: those of a contact are ``slot_shapes[contacts.slot]``."""
+        return np.repeat(self.pairs, np.diff(self.pair_slots), axis=0)
 
     @property
     def pair_slots(self) -> np.ndarray:

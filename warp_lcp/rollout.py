@@ -134,8 +134,9 @@ class Recorder:
         """Targets and forces of all steps on the device, by Control's fields."""
         if not control:
             return {}
-        if not isinstance(control, Mapping) or not set(control) <= set(CONTROLS):
-            raise WarpLcpError(f"rollout: control is {control!r:.60}; give a dict with some of {', '.join(CONTROLS)}")
+        unknown = [name for name in control if name not in CONTROLS] if isinstance(control, Mapping) else [type(control).__name__]
+        if unknown:
+            raise WarpLcpError(f"rollout: control has {', '.join(map(repr, unknown))}; give a dict with some of {', '.join(CONTROLS)}")
         if self.sim.control is None:
             raise WarpLcpError("rollout: control drives joints, and the model has none; give wrench")
         return {name: self._source(name, value, steps, self.sim.model.nv, self.sim.real) for name, value in control.items()}

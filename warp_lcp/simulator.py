@@ -7,7 +7,7 @@ import enum
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from . import articulation, hulls
+from . import articulation, hulls, joints
+from .arrays import check_finite, read
 from .errors import SimulationError, WarpLcpError, positive_number, whole_number
 from .kernels import (
     articulated,
@@ -92,6 +93,7 @@ class Contacts:
     Attributes:
         count: [E] contacts in each environment.
         bodies: [E, R] vec2i, bodies a and b; -1 = the world.
+        slot: [E, R] which point of which pair: its shapes are ``Model.slot_shapes[slot]``.
         point: [E, R] vec3, world, half-way across the gap, m.
         gap: [E, R] phi, m.
         frame: [E, R] mat33, rows n (from a to b), t1, t2 in world axes.
@@ -108,11 +110,15 @@ class Contacts:
     impulse: wp.array
     velocity: wp.array
     state: wp.array
+    slot: wp.array
 
 
 @dataclass(frozen=True)
 class Control:
     """What drives the joints, writable on the device; stays until changed. E environments, by velocity, as ``v``.
+
+    Arrays of Warp, whose ``assign`` fills them from their beginning with as many numbers as it is given, whatever their shape;
+    :meth:`Simulator.set_control` checks shapes and numbers.
 
     Attributes:
         position: [E, nv] m or rad, target of each drive; not looked at where a velocity has no drive.
@@ -315,6 +321,28 @@ class Simulator:
                 self._set_constant(self.parameters, name, value)
         self._combine_pairs()
 
+    def set_control(self, **values: Any) -> None:
+        """Write ``position``, ``velocity`` or ``force`` of :attr:`control` for all environments.
+
+        Each is [nv], the same for all, or [num_envs, nv], by velocity (:meth:`Model.velocities` says where a joint's are); a number stands
+        for all of them. SI units. Without a copy over the host: write the arrays of :attr:`control`.
+
+        Raises:
+            WarpLcpError: for an unknown name, a wrong shape, a number that is not finite, or a model without joints.
+        """
+        if self.control is None:
+            raise WarpLcpError("set_control: drives are on joints, and the model has none; write wrench")
+        names, shape = [field.name for field in fields(Control)], (self.num_envs, self.model.nv)
+        for name, value in values.items():
+            if name not in names:
+                raise WarpLcpError(f"set_control: {name!r} is nothing of it; choose from {', '.join(names)}")
+            numbers = read("set_control", name, value)
+            numbers = np.asarray(numbers.numpy() if isinstance(numbers, wp.array) else numbers, dtype=self._numpy_real)
+            if numbers.shape not in ((), shape[1:], shape):
+                raise WarpLcpError(f"set_control: {name} has shape {numbers.shape}; give {shape[1:]} or {shape}")
+            check_finite("set_control", name, numbers)
+            getattr(self.control, name).assign(np.broadcast_to(numbers, shape))
+
     def _combine_pairs(self) -> None:
         """Friction and contact parameters of the pairs, from those of their shapes and bodies."""
         p, t, pairs = self.parameters, self._types, len(self.model.pairs)
@@ -397,7 +425,8 @@ class Simulator:
             allowed &= (possible | (self.model.mass == 0.0))[..., None, None]
         if not allowed.all():
             where = tuple(int(i) for i in np.argwhere(~allowed)[0])
-            raise WarpLcpError(f"set_parameters: {name}{list(where)} is {array[where]}; {PARAMETERS[name]}")
+            of = f" ({self.model.dof_names[where[1]]})" if name in JOINT_PARAMETERS else ""
+            raise WarpLcpError(f"set_parameters: {name}{list(where)}{of} is {array[where]}; {PARAMETERS[name]}")
         return array
 
     @property
@@ -411,6 +440,14 @@ class Simulator:
         """[E, B] spatial vector (velocity of the centre of mass [m/s], angular velocity [rad/s]), world axes."""
         self._refresh_bodies()
         return self.bodies.velocity
+
+    def loop_gaps(self) -> np.ndarray:
+        """[E, L, 2] m and rad, how far the present q leaves each of ``Model.loops`` from closed; of a distance how far out of its range.
+
+        Read back from the device. By some h^2 of what they do in motion; loops that cannot close stay open, whatever pulls at them.
+        """
+        poses = self.body_pose.numpy().astype(float)
+        return np.stack([joints.apart(loop, poses) for loop in self.model.loops], axis=1) if self.model.loops else poses[:, :0, :2]
 
     def mass_matrix(self) -> wp.array:
         """[E, nv, nv] M(q) of the present q, with armature: M dv/dt + c = f (eq. 13), symmetric; velocities as in :class:`Model`.
@@ -453,7 +490,7 @@ class Simulator:
         """Contacts of the last step (views of the device arrays)."""
         r = self.rows
         touching = self.mechanics.touching if self.model.articulated and len(self.mechanics.row_kind) else r.count
-        return Contacts(touching, r.body, r.point, r.gap, r.frame, r.impulse, r.velocity, r.state)
+        return Contacts(touching, r.body, r.point, r.gap, r.frame, r.impulse, r.velocity, r.state, r.slot)
 
     def _raise_for_status(self) -> None:
         status = self.status.numpy() & ~INFORMATIVE

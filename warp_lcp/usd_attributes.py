@@ -99,7 +99,7 @@ def unread(prim: Any, read: set[Any]) -> list[tuple[str, str]]:
             why = "no schema applied to this prim has it, so USD does not read it; apply PhysicsMassAPI, PhysicsRigidBodyAPI, ..."
         else:
             engine = next((v for k, v in VENDOR_NAMES.items() if family.startswith(k)), family)
-            why = f"an extension of {engine}; warp_lcp reads plain UsdPhysics"
+            why = f"an extension of {engine} that warp_lcp does not read"
         entries.append((", ".join(sorted(names)), why))
     return entries
 

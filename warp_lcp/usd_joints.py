@@ -90,6 +90,7 @@ class JointReader:
         stack_of = {stack[0]: stack for stack in stacks}
         for path, (desc, kind) in found.items():
             prim = reader.stage.GetPrimAtPath(path)
+            self._lost(path, desc, kind, prim)
             try:
                 if path in stack_of:
                     self._stack([(p, *found[p]) for p in stack_of[path]])
@@ -133,6 +134,10 @@ class JointReader:
                 raise ModelError(
                     f"{path}: {relation.GetName()} names {missing[0]}, which does not exist; mend it, or clear it for the world"
                 )
+            for target in relation.GetTargets():
+                if not reader.px.UsdGeom.Imageable(reader.stage.GetPrimAtPath(target)):
+                    mend = "which stands nowhere; name a body, or clear it for the world"
+                    raise ModelError(f"{path}: {relation.GetName()} names {target}, {mend}")
             if len(relation.GetTargets()) > 1:
                 reader.notes.append(f"{path}: {relation.GetName()} names several prims: {found} is taken")
         if bodies[0] == bodies[1]:
@@ -143,8 +148,32 @@ class JointReader:
             return None  # refused with its body
         if min(desc.breakForce, desc.breakTorque) < 1e30:
             reader._repeat(path, "physics:breakForce, physics:breakTorque", "joints do not break here")
+        for attribute in (schema.GetLocalRot0Attr(), schema.GetLocalRot1Attr()):
+            if attribute.Get().GetLength() == 0.0:
+                reader.notes.append(f"{path}: {attribute.GetName()} is zero, which is no rotation; (1, 0, 0, 0) is taken")
         first = self._frame(desc.rel0, desc.body0, schema.GetLocalPos0Attr().Get(), schema.GetLocalRot0Attr().Get())
         return bodies, [first, self._frame(desc.rel1, desc.body1, schema.GetLocalPos1Attr().Get(), schema.GetLocalRot1Attr().Get())]
+
+    def _lost(self, path: Any, desc: Any, kind: str, prim: Any) -> None:
+        """Tell of what acts along axes that the joint does not have."""
+        locked = {dof for dof, limit in _by_axis(desc.jointLimits) if limit.lower > limit.upper} if kind == "D6Joint" else set()
+        names = {dof[0].lower() + dof[1:]: dof for dof in (*DOFS, "Distance")}
+        own = {"RevoluteJoint": {"angular"}, "PrismaticJoint": {"linear"}, "D6Joint": set(names)}.get(kind, set())
+        applied = prim.GetAppliedSchemas()
+        for prefix, base in (("drive", "PhysicsDriveAPI"), ("limit", "PhysicsLimitAPI")):
+            authored = [a.GetName() for a in prim.GetAuthoredAttributes() if a.GetName().startswith(f"{prefix}:")]
+            without = [name for name in authored if f"{base}:{name.split(':')[1]}" not in applied]
+            if without:
+                self.reader._repeat(path, ", ".join(sorted(without)), f"no {base} is applied that has it: not read")
+        for schema in applied:
+            base, _, instance = schema.partition(":")
+            if base not in ("PhysicsDriveAPI", "PhysicsLimitAPI", "PhysicsJointStateAPI"):
+                continue
+            if instance not in own or (base == "PhysicsLimitAPI" and kind != "D6Joint"):
+                instances = f"takes {', '.join(sorted(own))} alone" if own and base != "PhysicsLimitAPI" else "takes none"
+                self.reader._repeat(path, schema, f"a {prim.GetTypeName()} {instances}: not read")
+            elif base == "PhysicsDriveAPI" and names.get(instance) in locked:
+                self.reader._repeat(path, schema, "the axis is locked: it drives nothing")
 
     def _joint(self, path: Any, desc: Any, kind: str, prim: Any) -> None:
         reader, sides = self.reader, self._sides(path, desc, prim)
@@ -254,7 +283,10 @@ class JointReader:
     def _single(self, path: Any, desc: Any, kind: str, prim: Any, frames: list[Any]) -> tuple[list[Any], dict[str, Any] | None]:
         """Of a revolute or prismatic joint: frames turned to its axis, which becomes x, and what acts along it; None = it is locked."""
         angular = kind == "RevoluteJoint"
-        turn = np.array(ALONG[str(desc.axis).rpartition(".")[2]])
+        axis = prim.GetAttribute("physics:axis").Get()
+        if axis not in ALONG:  # which the parser takes for x
+            raise ModelError(f"{path}: physics:axis is {axis!r}; give one of {', '.join(ALONG)}")
+        turn = np.array(ALONG[axis])
         frames = [np.r_[frame[:3], multiply(frame[3:], turn)] for frame in frames]
         if desc.limit.lower > desc.limit.upper:
             self.reader.notes.append(f"{path}: its lower limit is above its upper one: locked")
@@ -333,6 +365,9 @@ class JointReader:
     def _drive(self, path: Any, drive: Any, angular: bool) -> Drive | None:
         if not drive.enabled or not (drive.stiffness or drive.damping):
             return None
+        for name, value in (("stiffness", drive.stiffness), ("damping", drive.damping), ("maxForce", drive.forceLimit)):
+            if not value >= 0.0 or (value == math.inf and name != "maxForce"):
+                raise ModelError(f"{path}: its drive's physics:{name} is {value:g}; give a finite number, zero or greater")
         reader = self.reader
         unit = math.radians(1.0) if angular else reader.length
         force = reader.mass_unit * reader.length ** (2 if angular else 1)

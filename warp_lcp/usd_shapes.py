@@ -81,7 +81,7 @@ def solids(px: Any, prim: Any, desc: Any, frame: Any, moves: bool) -> tuple[Soli
     """What a collider is made of; ``desc`` is USD's own reading of it, ``frame`` its place (usd.py), ``moves`` whether forces move it.
 
     Raises:
-        ModelError: for a mesh that has no points, or one that moves freely and spans no volume.
+        ModelError: for a mesh that has no points, or one that moves freely and spans no volume; for an axis that is none.
         MissingExtra: no scipy, or no coacd, is installed.
     """
     kind = str(desc.type).rpartition(".")[2]
@@ -98,7 +98,10 @@ def solids(px: Any, prim: Any, desc: Any, frame: Any, moves: bool) -> tuple[Soli
         "CylinderShape": px.UsdGeom.Cylinder,
         "ConeShape": px.UsdGeom.Cone,
     }[kind](prim)
-    axis = "XYZ".index(str(schema.GetAxisAttr().Get()))
+    written = str(schema.GetAxisAttr().Get())
+    if written not in ("X", "Y", "Z"):
+        raise ModelError(f"{prim.GetPath()}: its axis is {written!r}; give one of X, Y, Z")
+    axis = "XYZ".index(written)
     if kind == "PlaneShape":
         return (Solid(ShapeType.PLANE, turn=frame.rotation.T @ _plane_axes(axis, frame)),)
     turn = np.roll(np.eye(3), 2 - axis, axis=1)  # the prim's axis becomes the shape's z
