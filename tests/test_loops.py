@@ -360,6 +360,18 @@ def test_a_loop_that_is_open_is_told(gap, stays, options):
         assert sim.loop_gaps().max() < 1e-5
 
 
+@pytest.mark.parametrize("gap", [(1e-4, 0, 0), (0.01, 0, 0), (0.5, 0, 0), (0.3, 0, 0.2), (-0.1, 0, 0.1)])
+@pytest.mark.parametrize("h", [1e-3, 5e-3])
+def test_a_loop_at_its_dead_point_does_not_run_away(gap, h):
+    """Short by a little, by a lot or within reach, in line or not: links of 0.5 m that are pulled at 3 m/s by levers of 0.1 m turn at
+    30 rad/s, and half as fast again is allowed. It was up to 39,000 rad/s, 888 for the tenth of a millimetre."""
+    sim = simulator(chain_between(np.array(gap)), dt=h)
+    sim.v.assign(np.array([[0.1, -0.2]]))
+    moved = sim.rollout(round(2.0 / h), record=("v", "status"))
+    assert not moved.status.numpy().any()
+    assert np.abs(moved.v.numpy()).max() < 45.0
+
+
 def test_a_loop_that_is_closed_is_not_told():
     assert not chain_between(np.zeros(3)).finalize().report.notes
 

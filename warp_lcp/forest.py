@@ -279,7 +279,7 @@ class Arrangement:
             if max(way, turn) > MOVED:
                 what = "a distance out of its range" if joint.distance is not None else "a loop that is open"
                 by = " and ".join(f"{x:.3g} {unit}" for x, unit in ((way, "m"), (turn, "rad")) if x > MOVED)
-                mend = "it is pulled there; where it cannot get there bodies are torn about: mend its frames, or where bodies stand"
+                mend = "it is pulled there, for ever where it cannot get there; mend its frames, or where bodies stand"
                 found.append(f"{joint.name.removesuffix(':weld')}: {what} at the start, by {by}: {mend}")
         lost = [joint.name for joint in self.loops if joint.distance is None and acts(joint)]
         why = "closes a loop between bodies that forces do not move, or without mass: its limits, drives and the like are left out"
