@@ -38,8 +38,8 @@ LOOP_RELAXATION = {wp.float64: 1.0e-5, wp.float32: 1.0e-4}
 MAX_CORRECTION = wp.constant(3.0)
 # Near a dead point of a loop next to nothing gives way to a pull p along its links, and at 3 m/s they would fly about: p becomes W x, where
 # x solves (W + max(DAMPED |p|, STIFFEST) W_alone) x = p, W_alone the mobility of its bodies without their joints. Such damped least squares
-# vanish with the gap. (A chain stretched 0.1 mm short of its end turned at 888 rad/s. With 0.03 s/m a four-bar at 20 ms, 0.28 rad a step, is
-# off by 0.053 rad after 2 s instead of 0.035, and rings that whip fly apart.)
+# vanish with the gap. (A chain stretched 0.1 mm short of its end turned at 888 rad/s. With 0.03 s/m a four-bar at 20 ms, 0.28 rad a step,
+# is off by 0.053 rad after 2 s instead of 0.035, and rings that whip fly apart.)
 DAMPED = wp.constant(0.01)  # s/m
 STIFFEST = wp.constant(1.0e-6)
 # A row of a loop along which the joints of its bodies let nothing move, but for this part of what they would do without, is left out.
