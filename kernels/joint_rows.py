@@ -36,11 +36,10 @@ FRICTION_RELAXATION = wp.constant(1.0e-9)
 LOOP_RELAXATION = {wp.float64: 1.0e-5, wp.float32: 1.0e-4}
 # What is further from where it should be is corrected no faster than this [m/s].
 MAX_CORRECTION = wp.constant(3.0)
-# Near a dead point of a loop next to nothing gives way to a pull p along its links, and at 3 m/s they would fly about: p becomes W x, where
-# x solves (W + max(DAMPED |p|, STIFFEST) W_alone) x = p, W_alone the mobility of its bodies without their joints. Such damped least squares
-# vanish with the gap. (A chain stretched 0.1 mm short of its end turned at 888 rad/s. With 0.03 s/m a four-bar at 20 ms, 0.28 rad a step,
-# is off by 0.053 rad after 2 s instead of 0.035, and rings that whip fly apart.)
-DAMPED = wp.constant(0.01)  # s/m
+# Near a dead point of a loop next to nothing gives way to a pull p along its links, and at 3 m/s they would fly about: p becomes W x with
+# (W + lambda) x = p, lambda = max(DAMPED |p|, STIFFEST) / m, m the mass of the loop and what hangs on it. Such damped least squares vanish
+# with the gap. (A chain stretched 0.1 mm short of its end turned at 888 rad/s.)
+DAMPED = wp.constant(0.02)  # s/m
 STIFFEST = wp.constant(1.0e-6)
 # A row of a loop along which the joints of its bodies let nothing move, but for this part of what they would do without, is left out.
 IMMOBILE = wp.constant(1.0e-10)
@@ -116,7 +115,23 @@ def functions(real) -> SimpleNamespace:
             phi = length * angle
         return frame, phi
 
-    return SimpleNamespace(loop_error=loop_error)
+    @wp.func
+    def damped(w: mat33, damping: real, p: vec3) -> vec3:
+        """w (w + damping)^-1 p of a positive semidefinite matrix, by factors L D L^T: cofactors cancel in single precision."""
+        d0 = w[0, 0] + damping
+        l1 = w[1, 0] / d0
+        l2 = w[2, 0] / d0
+        d1 = w[1, 1] + damping - l1 * w[1, 0]
+        s = w[2, 1] - l2 * w[1, 0]
+        l3 = s / d1
+        d2 = w[2, 2] + damping - l2 * w[2, 0] - l3 * s
+        y = vec3(p[0], p[1] - l1 * p[0], real(0.0))
+        x = vec3(real(0.0), real(0.0), (p[2] - l2 * p[0] - l3 * y[1]) / d2)
+        x[1] = y[1] / d1 - l3 * x[2]
+        x[0] = y[0] / d0 - l1 * x[1] - l2 * x[2]
+        return p - damping * x
+
+    return SimpleNamespace(loop_error=loop_error, damped=damped)
 
 
 @functools.cache
@@ -127,7 +142,8 @@ def make(real):
     Bodies, Contacts = t.Bodies, t.Contacts
     forest = tree.functions(real)
     Trees, divide, product, inertia_along = forest.Trees, forest.divide, forest.product, forest.inertia_along
-    loop_error = functions(real).loop_error
+    f = functions(real)
+    loop_error, damped = f.loop_error, f.damped
     loop_relaxation = real(LOOP_RELAXATION[real])
 
     @wp.func
@@ -297,8 +313,11 @@ def make(real):
                                 frame[r] = vec3()
                                 w[r] = real(0.0)
                                 free[r] = real(0.0)
-                        damped = alone * wp.max(real(DAMPED) * wp.length(shift), real(STIFFEST))
-                        shift = mobility * (wp.inverse(mobility + damped * wp.identity(n=3, dtype=real)) * shift)
+                        hanging = real(0.0)
+                        for side in range(sides):
+                            if trees.row_top[k][side] >= 0:
+                                hanging += real(1.0) / trees.mass[env, trees.row_top[k][side]]
+                        shift = damped(mobility, hanging * wp.max(real(DAMPED) * wp.length(shift), real(STIFFEST)), shift)
                     state = int(0)
                     if free[0] + shift[0] < real(0.0):
                         state = 1

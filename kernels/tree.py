@@ -89,6 +89,7 @@ def functions(real) -> SimpleNamespace:
         row_velocity: wp.array(dtype=int)  # [K] of a limit, drive or friction; -1
         row_body: wp.array(dtype=wp.vec2i)  # [K] of a loop or distance: a, b; of a velocity: -1, the body below its joint; -1 = world
         row_pose: wp.array2d(dtype=transform)  # [K, 2] frames on a and b
+        row_top: wp.array(dtype=wp.vec2i)  # [K] of a loop: uppermost bodies above a and b that no other of its bodies carries; -1 = none
         row_held: wp.array(dtype=wp.vec3i)  # [K] of a loop: which axes of the frame on a it holds
         row_limit: wp.array(dtype=real)  # [K] m or rad
         row_length: wp.array(dtype=real)  # [K] of a loop's turns: radius of gyration that makes them velocities, m

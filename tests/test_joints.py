@@ -706,12 +706,35 @@ def test_joints_by_name():
         assert set(changed) <= set(range(q.start, q.stop))
         assert len(changed) == 1
     for name, message in (
-        ("flex", "flex: there are /r/flex, /l/flex; give one of them"),
+        ("flex", "flex: there are /r/flex of lower, /l/flex of lower; give a name that one alone has"),
         ("shulder", "did you mean /robot/left/shoulder"),
         ("x", "there are base, "),
     ):
         with pytest.raises(wl.ModelError, match=message):
             model.velocities(name)
+
+
+def test_names_that_are_not_one_joint():
+    """A joint called as a body is, one without coordinates, one that closes a loop, and axes of a ball, which share a quaternion."""
+    builder = wl.ModelBuilder()
+    for name in ("base", "arm", "plate", "far"):
+        builder.add_body(name, mass=1.0, inertia=SMALL)
+    builder.add_joint(JointType.SPHERICAL, 0, 1, name="base", axis_names=("a", "b", "c"))
+    builder.add_joint(JointType.FIXED, 0, 2, name="weld")
+    builder.add_joint(JointType.REVOLUTE, 1, 2, name="last", loop=True)
+    builder.add_joint(JointType.REVOLUTE, 0, 3, name="joint5")
+    builder.add_joint(JointType.REVOLUTE, 3, 1, loop=True)  # called joint4
+    builder.add_joint(JointType.REVOLUTE, 3, 2, loop=True)  # joint5 is taken
+    model = builder.finalize()
+    assert (model.velocities("b"), model.coordinates("b")) == (slice(7, 8), slice(7, 11))
+    assert [loop.name for loop in model.loops] == ["last", "joint4", "joint6"]
+    for name, message in (
+        ("base", "base: there are base of base, base of arm; give a name"),
+        ("weld", "it has no coordinates"),
+        ("last", "it has no coordinates"),
+    ):
+        with pytest.raises(wl.ModelError, match=message):
+            model.coordinates(name)
 
 
 def test_shapes_of_contacts():
@@ -742,6 +765,9 @@ def test_control_is_checked_where_it_is_set():
     ):
         with pytest.raises(wl.WarpLcpError, match=message):
             sim.set_control(**values)
+    with pytest.raises(wl.WarpLcpError, match="velocity has shape"):
+        sim.set_control(position=[0.75], velocity=[1.0, 2.0])
+    assert sim.control.position.numpy().tolist() == [[0.25]] * 3  # nothing of it was written
     with pytest.raises(wl.WarpLcpError, match="the model has none"):
         simulator(paper_box(), dt=1e-3).set_control(position=0.0)
 

@@ -502,6 +502,11 @@ def test_joint_that_names_what_stands_nowhere_is_refused():
     assert "/J: physics:body0 names /Scene, which stands nowhere" in message
 
 
+def test_joint_that_names_a_prim_without_type_holds_to_the_world():
+    model = load('def "Group" {}', body("A", LIGHT, inner=""), joint("Revolute", "rel physics:body0 = </Group>; rel physics:body1 = </A>;"))
+    assert (model.nv, model.body_parent.tolist()) == (1, [-1])
+
+
 @pytest.mark.parametrize("kind", ["Revolute", "Prismatic"])
 def test_axis_that_is_none(kind):
     """The parser takes x for it."""
@@ -516,6 +521,7 @@ DRIVE = "float drive:{0}:physics:stiffness = 10; float drive:{0}:physics:damping
     [
         ("Revolute", DRIVE.format("linear"), ["PhysicsDriveAPI:linear"], "PhysicsDriveAPI:linear", "takes angular alone"),
         ("Prismatic", DRIVE.format("angular"), ["PhysicsDriveAPI:angular"], "PhysicsDriveAPI:angular", "takes linear alone"),
+        ("Fixed", "float state:linear:physics:position = 1;", ["PhysicsJointStateAPI:linear"], "PhysicsJointStateAPI:linear", "takes none"),
         ("Spherical", DRIVE.format("rotX"), ["PhysicsDriveAPI:rotX"], "PhysicsDriveAPI:rotX", "takes none"),
         ("Revolute", "float limit:rotX:physics:low = -10;", ["PhysicsLimitAPI:rotX"], "PhysicsLimitAPI:rotX", "takes none"),
         (
@@ -533,6 +539,13 @@ def test_what_acts_along_an_axis_that_the_joint_has_not_is_told(kind, content, a
     (told,) = [i for i in model.report.ignored if why in i.why]
     assert (told.path, told.what) == ("/J", what or "PhysicsDriveAPI:transX")
     assert not model.drive[6:, :2].any()
+
+
+def test_drives_that_drive_nothing_are_not_told():
+    """Converters apply them everywhere."""
+    idle = "float drive:linear:physics:stiffness = 0; float drive:linear:physics:maxForce = 100; float limit:rotX:physics:high = inf;"
+    model = load(*pair("Fixed", idle, ["PhysicsDriveAPI:linear", "PhysicsLimitAPI:rotX"]))
+    assert not [i for i in model.report.ignored if i.path == "/J"]
 
 
 def test_a_rotation_of_no_length_is_told():

@@ -59,7 +59,9 @@ def arrays(sim: Any, Trees: Any) -> Any:
         setattr(
             trees, f"row_{name}", sim.ints(values) if name != "held" else wp.array(values.reshape(-1, 3), dtype=wp.vec3i, device=sim.device)
         )
-    trees.row_body = wp.array(np.array([row.bodies for row in table], dtype=np.int32).reshape(-1, 2), dtype=wp.vec2i, device=sim.device)
+    for name in ("body", "top"):
+        ends = np.array([row.bodies if name == "body" else tops(model, row.bodies) for row in table], dtype=np.int32).reshape(-1, 2)
+        setattr(trees, f"row_{name}", wp.array(ends, dtype=wp.vec2i, device=sim.device))
     trees.row_pose = sim._constant(np.array([row.frames for row in table]).reshape(-1, 2, 7), t.transform)
     trees.row_limit = sim._constant(np.array([row.limit for row in table]), real)
     trees.row_length = sim._constant(np.array([row.length for row in table]), real)
@@ -137,6 +139,18 @@ def rows(model: Model) -> list[Row]:
             gyration = [float(np.sqrt(np.trace(model.inertia[b]) / (2.0 * model.mass[b]))) for b in solid]
             table.append(replace(base, kind=int(tree.LOOP_TURN), held=loop.turns, length=min(gyration, default=1.0)))
     return table
+
+
+def tops(model: Model, bodies: tuple[int, int]) -> tuple[int, int]:
+    """Of two bodies, -1 = world: the uppermost body on the path to each that is not on that to the other; -1 where forces move none."""
+    paths: list[list[int]] = [[], []]
+    for path, b in zip(paths, bodies, strict=True):
+        while b >= 0:
+            path.insert(0, b)
+            b = int(model.body_parent[b])
+    shared = sum(a == b for a, b in zip(*paths, strict=False))
+    first = [next((b for b in path[shared:] if model.movable[b]), -1) for path in paths]
+    return first[0], first[1]
 
 
 def possible(model: Model, name: str, value: np.ndarray) -> np.ndarray:

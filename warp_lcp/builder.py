@@ -202,8 +202,10 @@ class ModelBuilder:
         Raises:
             ModelError: for a joint that is none, or a number that is not finite or negative.
         """
-        name = f"joint{len(self._joints)}" if name is None else name
-        if any(joint.name == name for joint in self._joints):
+        taken = {joint.name for joint in self._joints}
+        if name is None:
+            name = next(x for k in range(len(taken), 2 * len(taken) + 1) if (x := f"joint{k}") not in taken)
+        if name in taken:
             raise ModelError(f"{name}: a joint of this name exists already; give each joint its own name")
         for body in (parent, child):
             if not isinstance(body, (int, np.integer)) or not -1 <= body < len(self._bodies):

@@ -93,7 +93,7 @@ def _parser() -> _Parser:
         help="steps between rows of --out (default 1) and frames of --rerun (default 60 a simulated second)",
     )
     add("--rerun", metavar="SINK", help="stream to a file ending in .rrd, 'spawn', 'serve' or the URL of a viewer")
-    add("--out", metavar="FILE.npz", help="write time, poses, velocities, status, residual and iterations")
+    add("--out", metavar="FILE.npz", help="write time, poses, velocities, status, residual and iterations; of joints q and v")
     from .cli_solve import add_arguments
 
     solve = commands.add_parser("solve", help="solve complementarity problems from a file", allow_abbrev=False)

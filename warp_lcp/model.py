@@ -421,32 +421,39 @@ class Model:
             ModelError: as :meth:`velocities` does.
         """
         found = self._named(name)
-        b = self.dof_body[found[0]]
-        if self.dof_kind[found[0]] in (DofKind.FREE, DofKind.PRESCRIBED, DofKind.BALL):
-            start, count = self.q_start[b], 4 if self.dof_kind[found[0]] == DofKind.BALL else 7
+        b, kind = self.dof_body[found[0]], self.dof_kind[found[0]]
+        if kind in (DofKind.BALL, DofKind.BALL_ON):
+            start, count = self.q_start[b], 4
+        elif kind in (DofKind.FREE, DofKind.PRESCRIBED):
+            start, count = self.q_start[b], 7
         else:
             start, count = self.q_start[b] + found[0] - self.v_start[b], len(found)
         return slice(int(start), int(start) + count)
 
     def _named(self, name: str) -> list[int]:
         """Velocities of a joint, of an axis or of a body that no joint carries."""
-        known: dict[str, list[int]] = {}
+        known: dict[tuple[str, int], list[int]] = {}
         for i, (own, b) in enumerate(zip(self.dof_names, self.dof_body, strict=True)):
-            for called in dict.fromkeys((own, self.joint_names[b] or own)):
-                known.setdefault(called, []).append(i)
-        fitting = [name] if name in known else [full for full in known if full.rpartition("/")[2] == name]
+            known.setdefault((own, int(b)), []).append(i)
+        for b, joint in enumerate(self.joint_names):  # of several axes that have names of their own, unless one of them is the joint's
+            if joint and (joint, b) not in known and (all_of_it := np.flatnonzero(self.dof_body == b).tolist()):
+                known[joint, b] = all_of_it
+        fitting = [key for key in known if key[0] == name] or [key for key in known if key[0].rpartition("/")[2] == name]
         if len(fitting) == 1:
             return known[fitting[0]]
         if fitting:
-            raise ModelError(f"{name}: there are {', '.join(fitting[:3])}{' and others' if len(fitting) > 3 else ''}; give one of them")
-        short = {full.rpartition("/")[2]: full for full in known}
+            which = ", ".join(f"{full} of {self.body_names[b]}" for full, b in fitting[:3]) + (" and others" if len(fitting) > 3 else "")
+            raise ModelError(f"{name}: there are {which}; give a name that one alone has")
+        if name in self.joint_names or name in [loop.name for loop in self.loops]:
+            raise ModelError(f"{name}: this joint is fixed or closes a loop; it has no coordinates")
+        short = {full.rpartition("/")[2]: full for full, _ in known}
         near = difflib.get_close_matches(name.rpartition("/")[2], short, n=3)
-        hint = f"did you mean {', '.join(short[x] for x in near)}?" if near else f"there are {', '.join(list(known)[:6])} ..."
+        hint = f"did you mean {', '.join(short[x] for x in near)}?" if near else f"there are {', '.join(list(short.values())[:6])} ..."
         raise ModelError(f"{name}: no joint and no free body has this name; {hint}")
 
     @property
     def slot_shapes(self) -> np.ndarray:
-        """[C, 2] shapes a and b of each contact slot: those of a contact are ``slot_shapes[contacts.slot]``."""
+        """[C, 2] shapes a and b of each contact slot: ``slot_shapes[slot]`` of a contact's. Made anew each time."""
         return np.repeat(self.pairs, np.diff(self.pair_slots), axis=0)
 
     @property

@@ -134,9 +134,10 @@ class Recorder:
         """Targets and forces of all steps on the device, by Control's fields."""
         if not control:
             return {}
-        unknown = [name for name in control if name not in CONTROLS] if isinstance(control, Mapping) else [type(control).__name__]
+        given = list(control) if isinstance(control, Mapping) else [f"no dict but a {type(control).__name__}"]
+        unknown = [str(name) for name in given if name not in CONTROLS]
         if unknown:
-            raise WarpLcpError(f"rollout: control has {', '.join(map(repr, unknown))}; give a dict with some of {', '.join(CONTROLS)}")
+            raise WarpLcpError(f"rollout: control has {', '.join(unknown)}; give a dict with some of {', '.join(CONTROLS)}")
         if self.sim.control is None:
             raise WarpLcpError("rollout: control drives joints, and the model has none; give wrench")
         return {name: self._source(name, value, steps, self.sim.model.nv, self.sim.real) for name, value in control.items()}

@@ -93,7 +93,7 @@ class Contacts:
     Attributes:
         count: [E] contacts in each environment.
         bodies: [E, R] vec2i, bodies a and b; -1 = the world.
-        slot: [E, R] which point of which pair: its shapes are ``Model.slot_shapes[slot]``.
+        slot: [E, R] which point of which pair; its shapes are ``Model.slot_shapes[slot]``. (Of rows of joints it is negative.)
         point: [E, R] vec3, world, half-way across the gap, m.
         gap: [E, R] phi, m.
         frame: [E, R] mat33, rows n (from a to b), t1, t2 in world axes.
@@ -333,15 +333,18 @@ class Simulator:
         if self.control is None:
             raise WarpLcpError("set_control: drives are on joints, and the model has none; write wrench")
         names, shape = [field.name for field in fields(Control)], (self.num_envs, self.model.nv)
+        checked = {}
         for name, value in values.items():
             if name not in names:
                 raise WarpLcpError(f"set_control: {name!r} is nothing of it; choose from {', '.join(names)}")
             numbers = read("set_control", name, value)
             numbers = np.asarray(numbers.numpy() if isinstance(numbers, wp.array) else numbers, dtype=self._numpy_real)
-            if numbers.shape not in ((), shape[1:], shape):
+            if numbers.shape not in ((), shape[1:], (1, *shape[1:]), shape):
                 raise WarpLcpError(f"set_control: {name} has shape {numbers.shape}; give {shape[1:]} or {shape}")
             check_finite("set_control", name, numbers)
-            getattr(self.control, name).assign(np.broadcast_to(numbers, shape))
+            checked[name] = np.broadcast_to(numbers, shape)
+        for name, numbers in checked.items():
+            getattr(self.control, name).assign(numbers)
 
     def _combine_pairs(self) -> None:
         """Friction and contact parameters of the pairs, from those of their shapes and bodies."""

@@ -86,7 +86,7 @@ def unread(prim: Any, read: set[Any]) -> list[tuple[str, str]]:
         elif family == "physics":
             defined = set(prim.GetPrimDefinition().GetPropertyNames()) if defined is None else defined
             stray = name.count(":") == 1 and name not in defined and not isinstance(attribute.Get(), str)
-            if stray and not _neutral(attribute.Get()):
+            if stray and not neutral(attribute.Get()):
                 families.setdefault("physics", []).append(name)
         elif attribute.GetPath() not in read and _changes_motion(name, attribute):
             families.setdefault(family, []).append(name)
@@ -118,14 +118,14 @@ def _changes_motion(name: str, attribute: Any) -> bool:
     family, _, rest = name.partition(":")
     names = VENDOR_ATTRIBUTES.get(family, {})
     if names is None:
-        return not _neutral(attribute.Get())
+        return not neutral(attribute.Get())
     if rest not in names:
         return False
     value, default = attribute.Get(), names[rest]
-    return value != default and (default is True or not _neutral(value))
+    return value != default and (default is True or not neutral(value))
 
 
-def _neutral(value: Any) -> bool:
+def neutral(value: Any) -> bool:
     """Zero, false, empty or infinite: the ways in which schemas say 'nothing'."""
     if value is None or isinstance(value, str):
         return not value

@@ -27,7 +27,7 @@ import numpy as np
 from .errors import ModelError
 from .joints import compose, inverse, multiply, rotate
 from .model import Drive, Ignored, JointType
-from .usd_attributes import written
+from .usd_attributes import neutral, written
 
 #: The axes of the parser's degrees of freedom.
 DOFS = {"TransX": "tx", "TransY": "ty", "TransZ": "tz", "RotX": "rx", "RotY": "ry", "RotZ": "rz"}
@@ -135,7 +135,8 @@ class JointReader:
                     f"{path}: {relation.GetName()} names {missing[0]}, which does not exist; mend it, or clear it for the world"
                 )
             for target in relation.GetTargets():
-                if not reader.px.UsdGeom.Imageable(reader.stage.GetPrimAtPath(target)):
+                named = reader.stage.GetPrimAtPath(target)
+                if named.IsA(reader.px.Usd.Typed) and not named.IsA(reader.px.UsdGeom.Imageable):  # of what has no type one cannot know
                     mend = "which stands nowhere; name a body, or clear it for the world"
                     raise ModelError(f"{path}: {relation.GetName()} names {target}, {mend}")
             if len(relation.GetTargets()) > 1:
@@ -159,15 +160,19 @@ class JointReader:
         locked = {dof for dof, limit in _by_axis(desc.jointLimits) if limit.lower > limit.upper} if kind == "D6Joint" else set()
         names = {dof[0].lower() + dof[1:]: dof for dof in (*DOFS, "Distance")}
         own = {"RevoluteJoint": {"angular"}, "PrismaticJoint": {"linear"}, "D6Joint": set(names)}.get(kind, set())
-        applied = prim.GetAppliedSchemas()
-        for prefix, base in (("drive", "PhysicsDriveAPI"), ("limit", "PhysicsLimitAPI")):
-            authored = [a.GetName() for a in prim.GetAuthoredAttributes() if a.GetName().startswith(f"{prefix}:")]
-            without = [name for name in authored if f"{base}:{name.split(':')[1]}" not in applied]
+        metadata = prim.GetMetadata("apiSchemas")  # which has those that USD does not know as well
+        applied = dict.fromkeys([*prim.GetAppliedSchemas(), *(metadata.GetAppliedItems() if metadata else ())])
+        prefixes = {"PhysicsDriveAPI": "drive", "PhysicsLimitAPI": "limit", "PhysicsJointStateAPI": "state"}
+        acting = [a.GetName() for a in prim.GetAuthoredAttributes() if not neutral(a.Get())]
+        for base in ("PhysicsDriveAPI", "PhysicsLimitAPI"):
+            names_it = [name for name in acting if name.startswith(f"{prefixes[base]}:")]
+            without = [name for name in names_it if f"{base}:{name.split(':')[1]}" not in applied]
             if without:
                 self.reader._repeat(path, ", ".join(sorted(without)), f"no {base} is applied that has it: not read")
         for schema in applied:
             base, _, instance = schema.partition(":")
-            if base not in ("PhysicsDriveAPI", "PhysicsLimitAPI", "PhysicsJointStateAPI"):
+            numbers = ("stiffness", "damping", "low", "high", "position", "velocity")
+            if base not in prefixes or not {f"{prefixes[base]}:{instance}:physics:{name}" for name in numbers} & set(acting):
                 continue
             if instance not in own or (base == "PhysicsLimitAPI" and kind != "D6Joint"):
                 instances = f"takes {', '.join(sorted(own))} alone" if own and base != "PhysicsLimitAPI" else "takes none"
@@ -283,7 +288,7 @@ class JointReader:
     def _single(self, path: Any, desc: Any, kind: str, prim: Any, frames: list[Any]) -> tuple[list[Any], dict[str, Any] | None]:
         """Of a revolute or prismatic joint: frames turned to its axis, which becomes x, and what acts along it; None = it is locked."""
         angular = kind == "RevoluteJoint"
-        axis = prim.GetAttribute("physics:axis").Get()
+        axis = prim.GetAttribute("physics:axis").Get() or "X"
         if axis not in ALONG:  # which the parser takes for x
             raise ModelError(f"{path}: physics:axis is {axis!r}; give one of {', '.join(ALONG)}")
         turn = np.array(ALONG[axis])
