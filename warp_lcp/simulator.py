@@ -7,7 +7,7 @@ import enum
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -42,7 +42,7 @@ from .kernels.types import scalar_types
 from .laws import Law
 from .methods import METHODS, chosen
 from .model import CONVEX, Model, ShapeType
-from .rollout import Recorder, Rollout
+from .rollout import CONTROLS, Recorder, Rollout
 
 INTEGRATORS = ("euler", "midpoint")
 PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.float32)}
@@ -332,11 +332,11 @@ class Simulator:
         """
         if self.control is None:
             raise WarpLcpError("set_control: drives are on joints, and the model has none; write wrench")
-        names, shape = [field.name for field in fields(Control)], (self.num_envs, self.model.nv)
+        shape = (self.num_envs, self.model.nv)
         checked = {}
         for name, value in values.items():
-            if name not in names:
-                raise WarpLcpError(f"set_control: {name!r} is nothing of it; choose from {', '.join(names)}")
+            if name not in CONTROLS:
+                raise WarpLcpError(f"set_control: {name!r} is nothing of it; choose from {', '.join(CONTROLS)}")
             numbers = read("set_control", name, value)
             numbers = np.asarray(numbers.numpy() if isinstance(numbers, wp.array) else numbers, dtype=self._numpy_real)
             if numbers.shape not in ((), shape[1:], (1, *shape[1:]), shape):
