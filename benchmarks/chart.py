@@ -148,6 +148,7 @@ def clock_of(case: Case, h: float, device: Any, options: dict[str, Any]) -> tupl
 
     def of(scene: Scene) -> Clock:
         sim = scene.simulator(device=device, **options)
+        sim.step(0)
 
         def clock() -> float:
             scene.restart(sim)

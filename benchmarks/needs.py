@@ -94,6 +94,7 @@ def times(sims: Sequence[wl.Simulator], steps: int, repetitions: int) -> np.ndar
     """[repetitions, simulators] seconds (of the processor) an env-step over so many steps from the start, in turns."""
     slices = []
     for sim in sims:
+        sim.step(0)
         sim.reset()
         begin = time.process_time()
         sim.step(steps)  # warms up as well

@@ -68,7 +68,7 @@ def scenes() -> list[wl.Model]:
 def kernels(precision: str) -> dict[str, wp.Kernel]:
     """Every kernel of one precision by its name; a kernel's instances after the first as name[what it is built for]."""
     real = PRECISIONS[precision][0]
-    found = {"collect_status": watch.collect_status, "solve_contacts": contact_problem.make(real)}
+    found = {"collect_status": watch.make(), "solve_contacts": contact_problem.make(real)}
     found |= {name: part for name, part in vars(record.make(real)).items() if isinstance(part, wp.Kernel)}
     found |= {"dynamics": articulated.make(real).dynamics, "project": projection.make(real)}
     found |= {f"solve_batch[{method}]": solve_batch.make(real, method) for method in solve_batch.SOLVERS}
@@ -81,7 +81,9 @@ def kernels(precision: str) -> dict[str, wp.Kernel]:
         options.append({"method": "pgs", "integrator": "midpoint"})
         laws = [{"formulation": law} for law in ("coulomb", "hybrid")]
         for option in (*options, *laws):
-            for kernel in wl.Simulator(model, precision=precision, device="cpu", **option).kernels:
+            sim = wl.Simulator(model, precision=precision, device="cpu", **option)
+            sim.step(0)  # modules are compiled for one device at a time
+            for kernel in sim.kernels:
                 if kernel not in found.values():
                     name, what = kernel.key.split("__")[-1], ", ".join(filter(None, (option.get("formulation"), bounces)))
                     found[f"{name}[{what}]" if name in found else name] = kernel

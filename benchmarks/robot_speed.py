@@ -95,6 +95,7 @@ def remarks(mine: dict[str, Any], other: dict[str, Any]) -> list[str]:
 def one(robot: Robot, sessions: list[Session], repetitions: int) -> Iterator[dict[str, Any]]:
     """Ours and every variant of every peer with one robot; a line with 'refused' for each that cannot have it."""
     sim = robot.simulator(device="cpu")
+    sim.step(0)
     end, worth = record(sim, robot)
     tasks: list[Task] = []
     for each in sessions:

@@ -71,6 +71,7 @@ def one(name: str, envs: int, seconds: float, device: wp.Device, **options: Any)
 
 def count(name: str, sim: wl.Simulator, steps: int, start: Callable[[wl.Simulator], None]) -> dict[str, Any]:
     """Counts over every environment and step, from where `start` puts them."""
+    sim.step(0)
     start(sim)
     envs = sim.num_envs
     counts, bits, worst = np.zeros(len(EDGES) - 1, dtype=np.int64), dict.fromkeys((s.name for s in wl.Status if s), 0), 0.0

@@ -184,6 +184,7 @@ def copy_rate(size: float) -> float:
 def measure(quick: bool) -> dict[str, Any]:
     """Rates of the processor, one row a launch, and the step as a whole; nanoseconds, bytes and flops of an environment."""
     sim = scenes.scene("rest", ENVS).simulator(device="cpu")
+    sim.step(0)
     sim.step(WARM_UP)
     with caught() as launches:
         sim._step_kernels()

@@ -17,9 +17,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import tree
+from .declare import factory, kernel
 from .tree import ANGULAR, BALL, BALL_ON, FREE, HARD, LINEAR, PRESCRIBED
 from .types import FREE as FREE_JOINT
-from .types import KINEMATIC, OPTIONS, scalar_types
+from .types import KINEMATIC, scalar_types
 
 # Rounds in which c follows the mean velocity.
 BIAS_ROUNDS = wp.constant(6)
@@ -225,7 +226,7 @@ def functions(real) -> SimpleNamespace:
     return SimpleNamespace(forces=forces, inertias=inertias, factorise=factorise, matters=matters, impulses=impulses)
 
 
-@functools.cache
+@factory
 def make(real) -> SimpleNamespace:
     """Kernels of scenes with joints; ``dynamics`` of any scene. Launch with dim (E)."""
     t = scalar_types(real)
@@ -238,7 +239,7 @@ def make(real) -> SimpleNamespace:
     rounding = real(1.0e-16) if real is wp.float64 else real(1.0e-7)
     settled = real(1.0e-9) if real is wp.float64 else real(1.0e-6)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def kinematics(
         q: wp.array2d(dtype=real),
         v: wp.array2d(dtype=real),
@@ -310,7 +311,7 @@ def make(real) -> SimpleNamespace:
                 bodies.com[env, b] = centre
                 bodies.velocity[env, b] = pair(moved_by(twist, centre - origin), wp.spatial_bottom(twist))
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def dynamics(
         topology: Topology,
         parameters: Parameters,
@@ -389,7 +390,7 @@ def make(real) -> SimpleNamespace:
                 trees.twist[env, b] = trees.twist[env, b] + more
         return size
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def free_motion(
         topology: Topology,
         parameters: Parameters,
@@ -478,7 +479,7 @@ def make(real) -> SimpleNamespace:
                     elif trees.parent[b] >= 0:
                         bodies.inv_mass[env, b] = bodies.inv_mass[env, trees.parent[b]]
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def reset_control(mask: wp.array(dtype=wp.bool), target: wp.array(dtype=real), rate: wp.array(dtype=real), trees: Trees):
         """Nothing is applied, no step has left anything, and drives have the model's targets; launch with dim (E)."""
         env = wp.tid()

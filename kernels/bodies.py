@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kinematics and free motion of the bodies: q, v -> poses, and v_free = v + h M^-1 (f_a - c)  (eq. 24)."""
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
-from .types import FIXED, FREE, OPTIONS, scalar_types
+from .declare import factory, kernel
+from .types import FIXED, FREE, scalar_types
 
 NEWTON_ITERATIONS = wp.constant(8)
 
 
-@functools.cache
+@factory
 def make(real) -> SimpleNamespace:
     """Kernels ``kinematics`` and ``free_motion`` for the scalar type ``real``; launch with dim (E, B)."""
     t = scalar_types(real)
@@ -45,7 +45,7 @@ def make(real) -> SimpleNamespace:
             result = w + h * (wp.inverse(inertia) * torque)
         return result
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def kinematics(q: wp.array2d(dtype=real), v: wp.array2d(dtype=real), topology: Topology, bodies: Bodies, stride: int):
         start, b = wp.tid()
         for env in range(start, q.shape[0], stride):
@@ -67,7 +67,7 @@ def make(real) -> SimpleNamespace:
             bodies.pose[env, b] = pose
             bodies.velocity[env, b] = velocity
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def free_motion(
         topology: Topology,
         parameters: Parameters,

@@ -8,7 +8,8 @@ import warp as wp
 
 from .collide import NO_POINT, pair_functions
 from .contacts import ELASTIC_RANGE
-from .types import OPTIONS, scalar_types
+from .declare import factory, kernel
+from .types import scalar_types
 
 # Boxes that overlap along an axis by no more count as touching there. What rests does, so deep as its load presses it in. What
 # grazes an edge does not, but is not told from it, and ends so deep in its side: least and most of the smallest half extent.
@@ -155,7 +156,7 @@ def polygon(real) -> SimpleNamespace:
     return SimpleNamespace(Polygon=Polygon, clip=clip)
 
 
-@functools.cache
+@factory
 def make(real):
     """Kernel ``box_box``; launch with dim (E, lanes)."""
     t = scalar_types(real)
@@ -353,7 +354,7 @@ def make(real):
         write(slots, env, slot, wp.transform_point(face, p), sign * wp.transform_vector(face, outward), z, feature)
         return 1
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def box_box(
         topology: Topology,
         parameters: Parameters,

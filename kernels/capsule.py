@@ -19,7 +19,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from .collide import NO_POINT, pair_functions
-from .types import OPTIONS, scalar_types
+from .declare import factory, kernel
+from .types import scalar_types
 
 # Of the radius: a segment that strays from a side by less than this runs along it. The distance it misses is the square
 # of it over twice the radius, less than what "covered" allows.
@@ -162,7 +163,7 @@ def segment_functions(real) -> SimpleNamespace:
     )
 
 
-@functools.cache
+@factory
 def make(real) -> dict:
     """Kernels by the names of the two shape types; launch with dim (E, lanes), as those of ``collide``."""
     t = scalar_types(real)
@@ -225,7 +226,7 @@ def make(real) -> dict:
             left = wp.max(left, wp.min(real(0.5) * wp.dot(n, curl), real(0.0)))
             write_bent(slots, env, slot, p - n * (radius + real(0.5) * gap), n, gap, left, feature)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def plane_capsule(
         topology: Topology,
         parameters: Parameters,
@@ -251,7 +252,7 @@ def make(real) -> dict:
                     point = centre - normal * (size[0] + real(0.5) * gap)
                     write(slots, env, topology.pair_slots[pair] + k, point, normal, gap, 0)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def sphere_capsule(
         topology: Topology,
         parameters: Parameters,
@@ -405,7 +406,7 @@ def make(real) -> dict:
         else:
             in_edge(slots, env, slot, box, size, c, e, half, r, normal, axis - 3)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def box_capsule(
         topology: Topology,
         parameters: Parameters,
@@ -455,7 +456,7 @@ def make(real) -> dict:
                         motion.normal = wp.quat_rotate(turn, wp.quat_rotate(further, out))
                         beside_box(slots, env, slot, box, size, c, e, half, r, motion)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def capsule_capsule(
         topology: Topology,
         parameters: Parameters,

@@ -18,7 +18,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import friction, rigid, tree
-from .types import HELD, NOT_A_NUMBER, OPEN, OPTIONS, SLIDE, STICK, UNCERTIFIED, scalar_types
+from .declare import factory, kernel
+from .types import HELD, NOT_A_NUMBER, OPEN, SLIDE, STICK, UNCERTIFIED, scalar_types
 
 # Residual of an answer that is not a number.
 HUGE = wp.constant(1.0e30)
@@ -72,7 +73,7 @@ def functions(real, joints: bool = False) -> SimpleNamespace:
     return SimpleNamespace(judge=judge, remember=remember)
 
 
-@functools.cache
+@factory
 def make(real, trees: bool = False):
     """Kernel ``certify``; launch with dim (E). trees: for scenes with joints."""
     t = scalar_types(real)
@@ -88,7 +89,7 @@ def make(real, trees: bool = False):
     respond, push_joint, joint_velocity = forest.respond, forest.push_joint, forest.joint_velocity
     Mechanics = forest.Trees if trees else Bodies
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def certify(
         bodies: Mechanics,
         h: real,

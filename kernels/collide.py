@@ -10,12 +10,12 @@ where those of each kind start in the row and where the last ends, then the pair
 as a whole.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
-from .types import OPTIONS, scalar_types
+from .declare import factory, kernel
+from .types import scalar_types
 
 NO_POINT = wp.constant(1.0e30)
 # Cosine: directions from faces of a box that are square to each other, rotated to world axes, agree by less than this.
@@ -26,7 +26,7 @@ HAIR = wp.constant(1.0e-2)
 FADING = wp.constant(4.0)
 
 
-@functools.cache
+@factory
 def pair_functions(real) -> SimpleNamespace:
     """Functions that every pair kernel uses."""
     t = scalar_types(real)
@@ -66,7 +66,7 @@ def pair_functions(real) -> SimpleNamespace:
         far = a[3] + b[3]
         return wp.length_sq(d) >= far * far
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def bounds(topology: Topology, bodies: Bodies, h: real, lanes: int, stride: int):
         """Centre of every shape, and at least its radius + ``reach``, without a root; of the world's once."""
         start, lane = wp.tid()
@@ -87,7 +87,7 @@ def pair_functions(real) -> SimpleNamespace:
                         far += real(2.0) * h * bodies.alert[env]
                 bodies.bounds[env, shape] = vec4(centre[0], centre[1], centre[2], far)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def list_pairs(
         pairs: wp.array2d(dtype=int),
         pair_slots: wp.array(dtype=int),
@@ -234,7 +234,7 @@ def pair_functions(real) -> SimpleNamespace:
     )
 
 
-@functools.cache
+@factory
 def make(real) -> dict:
     """Kernels by the names of the two shape types; launch with dim (E, lanes).
 
@@ -247,7 +247,7 @@ def make(real) -> dict:
     shape_pose, reach, shape_velocity, write, write_bent = f.shape_pose, f.reach, f.shape_velocity, f.write, f.write_bent
     outside_box, bend, shape_turn, rotation, shift = f.outside_box, f.bend, f.shape_turn, f.rotation, f.shift
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def plane_sphere(
         topology: Topology,
         parameters: Parameters,
@@ -271,7 +271,7 @@ def make(real) -> dict:
                 point = centre - normal * (radius + real(0.5) * gap)
                 write(slots, env, topology.pair_slots[pair], point, normal, gap, 0)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def plane_box(
         topology: Topology,
         parameters: Parameters,
@@ -313,7 +313,7 @@ def make(real) -> dict:
                     else:
                         slots.gap[env, slot + k] = real(NO_POINT)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def sphere_sphere(
         topology: Topology,
         parameters: Parameters,
@@ -346,7 +346,7 @@ def make(real) -> dict:
                 left = bend(gap, distance, normal, h * u, wp.length(ahead), ahead)
                 write_bent(slots, env, topology.pair_slots[pair], a + normal * (ra + real(0.5) * gap), normal, gap, left, 0)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def sphere_box(
         topology: Topology,
         parameters: Parameters,

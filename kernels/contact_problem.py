@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Contact problems for the proximal method: given as arrays (W, q, mu), or the contact rows of an environment."""
 
-import functools
-
 import warp as wp
 
 from . import friction, proximal, rigid, tree
-from .types import BLOCK_OPTIONS, DISC, ITERATION_LIMIT, NOT_A_NUMBER, UNCERTIFIED, scalar_types, sync
+from .declare import BLOCK_OPTIONS, factory, kernel
+from .types import DISC, ITERATION_LIMIT, NOT_A_NUMBER, UNCERTIFIED, scalar_types, sync
 
 
-@functools.cache
+@factory
 def make(real):
     """Kernel ``solve_contacts`` for B problems of n contacts given as arrays; launch tiled with dim (P), P <= B workspaces."""
     t = scalar_types(real)
@@ -94,7 +93,7 @@ def make(real):
                 projected = vec3(normal, mu * normal * x[1] / size, mu * normal * x[2] / size)
         return p - projected
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
+    @kernel(BLOCK_OPTIONS)
     def solve_contacts(
         W: wp.array3d(dtype=real),
         q: wp.array2d(dtype=real),
@@ -189,7 +188,7 @@ def make(real):
     return solve_contacts
 
 
-@functools.cache
+@factory
 def make_contacts(real, trees: bool = False):
     """Kernel ``proximal_contacts`` for the rows of environments; launch tiled with dim (P). trees: for scenes with joints."""
     t = scalar_types(real)
@@ -233,7 +232,7 @@ def make_contacts(real, trees: bool = False):
                                 connect(g, slot, i, j)
         sync()
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
+    @kernel(BLOCK_OPTIONS)
     def proximal_contacts(
         bodies: Mechanics,
         contacts: Contacts,

@@ -16,7 +16,8 @@ import warp as wp
 
 from . import rigid, tree
 from .collide import NO_POINT, pair_functions
-from .types import CONE, DISC, FACETS, MAX, MIN, MULTIPLY, OPTIONS, OVERFLOW, REGULARIZED, scalar_types
+from .declare import factory, kernel
+from .types import CONE, DISC, FACETS, MAX, MIN, MULTIPLY, OVERFLOW, REGULARIZED, scalar_types
 
 # Overlaps that no load explains are pushed apart no faster than this [m/s], whatever the stiffness; what turns comes on top.
 MAX_DEPENETRATION_SPEED = wp.constant(3.0)
@@ -363,7 +364,7 @@ def combined_by(real):
     return combined
 
 
-@functools.cache
+@factory
 def make(real, trees: bool = False) -> SimpleNamespace:
     """Kernels ``combine_pairs`` (dim N, P), ``select_contacts`` (dim E) and ``contact_rows`` (dim E, lanes).
 
@@ -380,7 +381,7 @@ def make(real, trees: bool = False) -> SimpleNamespace:
     halve, product = forest.halve, forest.product
     Mechanics = forest.Trees if trees else Bodies
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def combine_pairs(topology: Topology, parameters: Parameters, combine: wp.array(dtype=int)):
         """Friction and contact parameters of every pair: of its two shapes' materials the mean, or as combine [P | 0] says, or Table 1."""
         i, pair = wp.tid()
@@ -519,7 +520,7 @@ def make(real, trees: bool = False) -> SimpleNamespace:
             down = not down
         return any_hit
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def select_contacts(
         topology: Topology,
         parameters: Parameters,
@@ -545,7 +546,7 @@ def make(real, trees: bool = False) -> SimpleNamespace:
                 count = select(topology, bodies, listed, slots, env, h, fall, True, contacts, status)
             contacts.count[env] = count
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def contact_rows(
         topology: Topology,
         parameters: Parameters,
@@ -601,7 +602,7 @@ def make(real, trees: bool = False) -> SimpleNamespace:
                 found = found or w < real(OPPOSED) * wp.sqrt(contacts.inv_mass[env, i][0] * contacts.inv_mass[env, k][0])
         return found
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def calm_overlaps(mechanics: Mechanics, contacts: Contacts, lanes: int, stride: int):
         """Overlaps that are pushed against each other part slowly.
 

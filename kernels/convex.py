@@ -20,8 +20,9 @@ import warp as wp
 
 from .box_box import axes
 from .collide import NO_POINT, pair_functions
+from .declare import factory, kernel
 from .shapes import CONE, PIECE, ROUND, functions
-from .types import OPTIONS, scalar_types
+from .types import scalar_types
 
 # Points of a pair of sharp shapes; corners of one cap on a plane; room for the corners of a face while it is clipped.
 POINTS = 8
@@ -329,7 +330,7 @@ def meeting(real):
     return meet
 
 
-@functools.cache
+@factory
 def make(real) -> SimpleNamespace:
     """Kernels ``sharp`` (cylinders, cones, hulls and boxes with each other) and ``on_plane``; launch with dim (E, lanes)."""
     t = scalar_types(real)
@@ -339,7 +340,7 @@ def make(real) -> SimpleNamespace:
     shape_pose, reach, shape_velocity, write = f.shape_pose, f.reach, f.shape_velocity, f.write
     inverse_mass, touching_depth, Hulls, ring_point, turned = a.inverse_mass, a.touching_depth, s.Hulls, s.ring_point, s.turned
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def sharp(
         topology: Topology,
         parameters: Parameters,
@@ -396,7 +397,7 @@ def make(real) -> SimpleNamespace:
                 for k in range(count, POINTS):
                     slots.gap[env, slot + k] = real(NO_POINT)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def on_plane(
         topology: Topology,
         parameters: Parameters,

@@ -22,8 +22,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from .collide import NO_POINT, pair_functions
+from .declare import factory, kernel
 from .shapes import CAPSULE, CONE, CYLINDER, SPHERE, functions
-from .types import OPTIONS, scalar_types
+from .types import scalar_types
 
 # Of the size: a corner that is this much nearer along the normal changes nothing.
 NEARER = {wp.float64: 1.0e-14, wp.float32: 1.0e-6}
@@ -590,7 +591,7 @@ def meeting(real, kind: str):
     return SimpleNamespace(meet=meet, moved=moved)
 
 
-@functools.cache
+@factory
 def make(real) -> dict:
     """Kernels by the lower shape type; launch with dim (E, lanes). Those of a mesh are in ``mesh``."""
     t = scalar_types(real)
@@ -601,7 +602,7 @@ def make(real) -> dict:
     write_bent = f.write_bent
     height, moved = e.height, meeting(real, "faceted").moved
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def plane_ellipsoid(
         topology: Topology,
         parameters: Parameters,
@@ -674,7 +675,7 @@ def make(real) -> dict:
 
     write_faceted, write_turned, write_rounded = (contact(kind) for kind in ("faceted", "turned", "rounded"))
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def faceted_ellipsoid(
         topology: Topology,
         parameters: Parameters,
@@ -692,7 +693,7 @@ def make(real) -> dict:
             for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
                 write_faceted(topology, bodies, env, listed[env, index], h, slots, hulls)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def turned_ellipsoid(
         topology: Topology,
         parameters: Parameters,
@@ -710,7 +711,7 @@ def make(real) -> dict:
             for index in range(listed[env, kind] + lane, listed[env, kind + 1], lanes):
                 write_turned(topology, bodies, env, listed[env, index], h, slots, hulls)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def ellipsoid_ellipsoid(
         topology: Topology,
         parameters: Parameters,

@@ -6,17 +6,17 @@ must not: v still holds the approach, and half of it would carry the body into w
 and leaves them to Euler for this step.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from . import rigid
 from .contacts import ELASTIC_RANGE
-from .types import FIXED, FREE, OPTIONS, scalar_types
+from .declare import factory, kernel
+from .types import FIXED, FREE, scalar_types
 
 
-@functools.cache
+@factory
 def make(real) -> SimpleNamespace:
     """Kernels ``integrate`` and ``integrate_midpoint`` (dim E, B), and ``guard`` (dim E), which goes before the latter."""
     t = scalar_types(real)
@@ -25,7 +25,7 @@ def make(real) -> SimpleNamespace:
     f = rigid.functions(real)
     point_velocity, rotation_by, moved = f.point_velocity, f.rotation_by, f.moved
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def integrate(
         topology: Topology,
         bodies: Bodies,
@@ -50,7 +50,7 @@ def make(real) -> SimpleNamespace:
             for k in range(6):
                 v[env, j + k] = velocity[k]
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def guard(
         parameters: Parameters,
         bodies: Bodies,
@@ -101,7 +101,7 @@ def make(real) -> SimpleNamespace:
                             if b >= 0:
                                 bodies.velocity[env, b] = next_velocity[env, b]
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def integrate_midpoint(
         topology: Topology,
         parameters: Parameters,

@@ -21,8 +21,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import tree
+from .declare import factory, kernel
 from .tree import CLOSER, LIMIT_HIGH, LINEAR, LOOP_TURN, LOOP_WAY
-from .types import HELD, OPTIONS, scalar_types
+from .types import HELD, scalar_types
 
 # Stiffness and damping of limits and distances for each kg that they hold: Table 1.
 STIFFNESS = wp.constant(1.0e10)
@@ -134,7 +135,7 @@ def functions(real) -> SimpleNamespace:
     return SimpleNamespace(loop_error=loop_error, damped=damped)
 
 
-@functools.cache
+@factory
 def make(real):
     """Kernel ``joint_rows``; launch with dim (E), after the contacts' rows."""
     t = scalar_types(real)
@@ -159,7 +160,7 @@ def make(real):
             d = phi / h
         return w / (h * (h * k + b)), d
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def joint_rows(
         trees: Trees,
         bodies: Bodies,

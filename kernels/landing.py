@@ -14,14 +14,14 @@ c was left out (rounds that did not settle) trees land as what was hit does, and
 landing: its poses are half-way ones.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from . import articulated, tree
+from .declare import factory, kernel
 from .tree import FAST, HARD
-from .types import OPTIONS, scalar_types
+from .types import scalar_types
 
 # What rows changed was a hit if it was, and less what they changed a step ago still is, more than this part of the largest velocity, and
 # more than this many times what v_free was beyond what was expected. (What rests is changed by as much as its weight gave it, a loop
@@ -37,7 +37,7 @@ MISSED = wp.constant(1.0e-4)
 MADE = wp.constant(0.05)
 
 
-@functools.cache
+@factory
 def make(real) -> SimpleNamespace:
     """Kernels ``integrate``, ``land`` after kinematics at q+, and ``drift``; launch with dim (E), ``drift`` with dim (E, B)."""
     t = scalar_types(real)
@@ -93,7 +93,7 @@ def make(real) -> SimpleNamespace:
         """By trees.largest of a tree."""
         return largest[1] > wp.max(real(SUDDEN) * largest[0], real(HIT) * largest[2])
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def integrate(
         topology: Topology,
         parameters: Parameters,
@@ -160,7 +160,7 @@ def make(real) -> SimpleNamespace:
             for b in range(trees.order.shape[0]):
                 advance(topology, trees, bodies, v, part * h, q, env, b)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def land(parameters: Parameters, trees: Trees, bodies: Bodies, h: real, v: wp.array2d(dtype=real), stride: int):
         """v, and the velocities of bodies, at q+ of what was hit."""
         start, _ = wp.tid()
@@ -204,7 +204,7 @@ def make(real) -> SimpleNamespace:
                     trees.twist[env, b] = trees.twist[env, b] + trees.gained[env, b]
                     bodies.velocity[env, b] = bodies.velocity[env, b] + gain(trees, bodies, env, b)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def drift(
         topology: Topology,
         trees: Trees,

@@ -24,8 +24,9 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import linear, problem, rigid, tree
+from .declare import BLOCK_OPTIONS, factory, kernel
 from .solve_batch import solver
-from .types import BLOCK_OPTIONS, HELD, ITERATION_LIMIT, scalar_types, sync
+from .types import HELD, ITERATION_LIMIT, scalar_types, sync
 
 
 @functools.cache
@@ -317,7 +318,7 @@ def functions(real, trees: bool = False) -> SimpleNamespace:
     )
 
 
-@functools.cache
+@factory
 def make(real, method: str, generators: bool = False, trees: bool = False):
     """Kernel ``assembled_lcp`` for 'lemke', 'murty' or 'judice_pires', of eq. 39 or of Anitescu and Potra.
 
@@ -332,7 +333,7 @@ def make(real, method: str, generators: bool = False, trees: bool = False):
     LcpWorkspace = problem.functions(real).LcpWorkspace
     solve = solver(real, method)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
+    @kernel(BLOCK_OPTIONS)
     def assembled_lcp(
         bodies: Mechanics,
         contacts: Contacts,

@@ -6,7 +6,6 @@ make no points, and what touches several at the same point counts once. Of more 
 keeps the slot in which it was one step ago.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
@@ -14,8 +13,9 @@ import warp as wp
 from . import convex, ellipsoid, rounded
 from .box_box import axes
 from .collide import NO_POINT, pair_functions
+from .declare import factory, kernel
 from .shapes import functions
-from .types import OPTIONS, scalar_types
+from .types import scalar_types
 
 # Slots of a pair, by the type of the shape on the mesh: ball, capsule, sharp, ellipsoid.
 SLOTS = {"SPHERE": 8, "CAPSULE": 12, "SHARP": 24, "ELLIPSOID": 8}
@@ -26,7 +26,7 @@ SAME = wp.constant(1.0e-6)
 LEANS = wp.constant(1.0e-4)
 
 
-@functools.cache
+@factory
 def make(real) -> SimpleNamespace:
     """Kernels ``sharp_on_mesh``, ``round_on_mesh`` and ``ellipsoid_on_mesh``; launch with dim (E, lanes)."""
     t = scalar_types(real)
@@ -125,7 +125,7 @@ def make(real) -> SimpleNamespace:
     def normal_of(hulls: Hulls, mesh: transform, piece: int) -> vec3:
         return wp.transform_vector(mesh, hulls.normal[hulls.first_face[piece]])
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def sharp_on_mesh(
         topology: Topology,
         parameters: Parameters,
@@ -203,7 +203,7 @@ def make(real) -> SimpleNamespace:
                             )
                 settle(slots, env, slot, number, normals, at, gaps, bends, features, count)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def round_on_mesh(
         topology: Topology,
         parameters: Parameters,
@@ -311,7 +311,7 @@ def make(real) -> SimpleNamespace:
                     seams += 1
         return on > 0 and on == seams
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def ellipsoid_on_mesh(
         topology: Topology,
         parameters: Parameters,

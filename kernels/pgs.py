@@ -6,15 +6,14 @@ what the new normal impulse admits, and v takes the change at once. Cold started
 on history where contacts are redundant.
 """
 
-import functools
-
 import warp as wp
 
 from . import friction, rigid, tree
-from .types import HELD, ITERATION_LIMIT, OPTIONS, scalar_types
+from .declare import factory, kernel
+from .types import HELD, ITERATION_LIMIT, scalar_types
 
 
-@functools.cache
+@factory
 def make(real, trees: bool = False):
     """Kernel ``pgs``; launch with dim (E). trees: for scenes with joints, whose v are those of Trees.half."""
     t = scalar_types(real)
@@ -44,7 +43,7 @@ def make(real, trees: bool = False):
                 u += real(2 * side - 1) * point_velocity(velocity[env, b] - free[env, b], point - com[env, b])
         return u
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def pgs(
         bodies: Mechanics,
         contacts: Contacts,

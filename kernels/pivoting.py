@@ -47,7 +47,8 @@ from types import SimpleNamespace
 import warp as wp
 
 from . import friction, sparse, systems
-from .types import BLOCK_OPTIONS, CLOSED, DISC, HELD, ITERATION_LIMIT, scalar_types, sync
+from .declare import BLOCK_OPTIONS, factory, kernel
+from .types import CLOSED, DISC, HELD, ITERATION_LIMIT, scalar_types, sync
 
 AXIS_STICKS = 0
 AXIS_SLIDES_UP = 1  # along +t: the impulse is -mu p_n
@@ -246,7 +247,7 @@ def functions(real, cone: bool, frozen: bool, joints: bool = False) -> SimpleNam
     return SimpleNamespace(has_friction=has_friction, operator=operator, update=update)
 
 
-@functools.cache
+@factory
 def make(real, cone: bool, frozen: bool, trees: bool = False) -> SimpleNamespace:
     """Bundle ``Workspace`` and kernel ``pivot`` for scenes with several movable bodies, or with joints; launch tiled with dim (P)."""
     t = scalar_types(real)
@@ -364,7 +365,7 @@ def make(real, cone: bool, frozen: bool, trees: bool = False) -> SimpleNamespace
                         length = real(0.1) * high
         return length, start, after, miss
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
+    @kernel(BLOCK_OPTIONS)
     def pivot(
         mechanics: Mechanics,
         contacts: Contacts,

@@ -10,13 +10,12 @@ of an environment further apart is taken back, and is the last of the step. (A f
 to close 0.2 mm.)
 """
 
-import functools
-
 import warp as wp
 
 from . import joint_rows, tree
+from .declare import factory, kernel
 from .tree import LOOP_TURN, LOOP_WAY
-from .types import OPTIONS, scalar_types
+from .types import scalar_types
 
 # Rounds in a step, and another that only looks at what the last one did.
 ROUNDS = wp.constant(5)
@@ -24,7 +23,7 @@ ROUNDS = wp.constant(5)
 REGULAR = wp.constant(1.0e-3)
 
 
-@functools.cache
+@factory
 def make(real):
     """Kernel ``project``; launch with dim (E), after kinematics, and kinematics after it."""
     t = scalar_types(real)
@@ -36,7 +35,7 @@ def make(real):
     advance = tree.motion(real)
     error = joint_rows.functions(real).loop_error
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def project(
         topology: Topology,
         parameters: Parameters,

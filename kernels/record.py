@@ -5,15 +5,15 @@ What changes from one rollout to the next, the addresses of its arrays first of 
 that the captured step reads it from there and is captured once.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
-from .types import OPTIONS, scalar_types
+from .declare import factory, kernel
+from .types import scalar_types
 
 
-@functools.cache
+@factory
 def make(real) -> SimpleNamespace:
     """The struct ``Tape`` and kernels ``apply_wrench``, ``apply_control``, ``record_row`` and ``add_seen``."""
     t = scalar_types(real)
@@ -37,7 +37,7 @@ def make(real) -> SimpleNamespace:
         residual: wp.array2d(dtype=real)  # [T, E] m/s
         residual_energy: wp.array2d(dtype=real)  # [T, E] J
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def apply_wrench(tape: wp.array(dtype=Tape), step: wp.array2d(dtype=int), wrench: wp.array2d(dtype=spatial), stride: int):
         """Wrenches of this step; launch with dim (E, B)."""
         start, b = wp.tid()
@@ -45,7 +45,7 @@ def make(real) -> SimpleNamespace:
         for env in range(start, wrench.shape[0], stride):
             wrench[env, b] = source[step[start, 0], env % source.shape[1], b]
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def apply_control(
         tape: wp.array(dtype=Tape),
         step: wp.array2d(dtype=int),
@@ -66,7 +66,7 @@ def make(real) -> SimpleNamespace:
             if source.force.shape[0] > 0:
                 force[env, i] = source.force[row, env % source.force.shape[1], i]
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def record_row(
         tape: wp.array(dtype=Tape),
         step: wp.array2d(dtype=int),
@@ -121,7 +121,7 @@ def make(real) -> SimpleNamespace:
                 status[env] = 0
                 iterations[env] = 0
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def add_seen(
         seen_status: wp.array(dtype=int),
         seen_iterations: wp.array(dtype=int),

@@ -1,21 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Masked reset: the state returns to q0, v0 and nothing that a step left behind survives."""
 
-import functools
-
 import warp as wp
 
-from .types import OPTIONS, scalar_types
+from .declare import factory, kernel
+from .types import scalar_types
 
 
-@functools.cache
+@factory
 def make(real):
     """Kernel ``reset``; launch with dim (E)."""
     t = scalar_types(real)
     Bodies, Contacts, Slots = t.Bodies, t.Contacts, t.Slots
     spatial = t.spatial
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def reset(
         mask: wp.array(dtype=wp.bool),
         q0: wp.array2d(dtype=real),

@@ -18,13 +18,13 @@ keeps E + h f . v / 2, whose change by impulses is W exactly; so is that of E by
 gain h |p| |g| / 2 an impact.
 """
 
-import functools
 from types import SimpleNamespace
 
 import warp as wp
 
 from .contacts import combined_by
-from .types import OPTIONS, RESTITUTION_REDUCED, SLIDE, scalar_types
+from .declare import factory, kernel
+from .types import RESTITUTION_REDUCED, SLIDE, scalar_types
 
 # A contact bounces where it approaches faster than this times the speed that the step adds to its approach (|g| h at least).
 # Slower ones would never come to rest; a ball does so with 0.5 and more (theory.md).
@@ -42,7 +42,7 @@ SEARCH = wp.constant(3)
 APPLY = wp.constant(4)  # the theta to stay with
 
 
-@functools.cache
+@factory
 def make(real) -> SimpleNamespace:
     """Bundle ``Bounces`` and kernels ``bounce`` (dim E, R), ``judge`` and ``settle`` (dim E)."""
     t = scalar_types(real)
@@ -68,7 +68,7 @@ def make(real) -> SimpleNamespace:
         todo: wp.array(dtype=int)  # [E] environments that have to be solved again...
         again: wp.array(dtype=int)  # [1] ... and their number
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def bounce(
         topology: Topology,
         parameters: Parameters,
@@ -188,7 +188,7 @@ def make(real) -> SimpleNamespace:
             if state[env, i] == SLIDE:
                 state[env, i] = 3
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def judge(
         attempt: int,
         h: real,
@@ -291,7 +291,7 @@ def make(real) -> SimpleNamespace:
                 reason[env] = 0
                 set_theta(contacts.shift, contacts.free, contacts.state, bounces.kick, env, count, after - theta)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def settle(contacts: Contacts, bounces: Bounces, status: wp.array(dtype=int), stride: int):
         """When all environments are done: contacts and status as the other stages know them."""
         start, _ = wp.tid()

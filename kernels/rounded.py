@@ -19,8 +19,9 @@ import warp as wp
 
 from .capsule import covered_within
 from .collide import NO_POINT, pair_functions
+from .declare import factory, kernel
 from .shapes import PIECE, functions
-from .types import OPTIONS, scalar_types
+from .types import scalar_types
 
 # Of the size: a core closer than this to the other shape has no direction of its own to it.
 MEETS = wp.constant(1.0e-7)
@@ -339,7 +340,7 @@ def meeting(real):
     return meet
 
 
-@functools.cache
+@factory
 def make(real):
     """Kernel ``rounded``; launch with dim (E, lanes)."""
     t = scalar_types(real)
@@ -348,7 +349,7 @@ def make(real):
     f, Hulls, meet = pair_functions(real), functions(real).Hulls, meeting(real)
     shape_pose, shape_motion, reach, write_bent = f.shape_pose, f.shape_motion, f.reach, f.write_bent
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def rounded(
         topology: Topology,
         parameters: Parameters,

@@ -6,15 +6,14 @@ The stages are those of contacts, pivoting and certify, made of the same functio
 Environments whose answer is not certified are listed, for ``certify`` to judge and the next method to solve.
 """
 
-import functools
-
 import warp as wp
 
 from . import certify, contacts, pivoting, rigid
-from .types import CLOSED, ITERATION_LIMIT, OPTIONS, scalar_types
+from .declare import factory, kernel
+from .types import CLOSED, ITERATION_LIMIT, scalar_types
 
 
-@functools.cache
+@factory
 def make(real, cone: bool, frozen: bool, rows: bool):
     """Kernel ``solve_single``; launch with dim (E). Without `rows` those that stand in Contacts are solved as they are."""
     t = scalar_types(real)
@@ -65,7 +64,7 @@ def make(real, cone: bool, frozen: bool, rows: bool):
             b[k] = x * p[k]
         return b
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=OPTIONS)
+    @kernel()
     def solve_single(
         topology: Topology,
         parameters: Parameters,

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The methods by name, and the kernel that runs one of them on a batch of problems and judges its answers."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import warp as wp
 
 from . import gauss_seidel, lemke, principal, problem
-from .types import BLOCK_OPTIONS, NOT_A_NUMBER, UNCERTIFIED, sync
+from .declare import BLOCK_OPTIONS, factory, kernel
+from .types import NOT_A_NUMBER, UNCERTIFIED, sync
 
 #: Functions (workspace, slot, n, limit, lane) -> (status bits, iterations), for a scalar type.
 SOLVERS: dict[str, Callable[[Any], Any]] = {
@@ -24,7 +24,7 @@ def solver(real: Any, method: str) -> Any:
     return SOLVERS[method](real)
 
 
-@functools.cache
+@factory
 def make(real, method: str):
     """Kernel ``solve_batch`` for problems given as arrays; launch tiled with dim (P), P <= B workspaces.
 
@@ -140,7 +140,7 @@ def make(real, method: str):
         load = load_with_rows
         shift = real(1.0)
 
-    @wp.kernel(module="unique", enable_backward=False, module_options=BLOCK_OPTIONS)
+    @kernel(BLOCK_OPTIONS)
     def solve_batch(
         M: wp.array3d(dtype=real),
         q: wp.array2d(dtype=real),

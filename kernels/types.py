@@ -41,11 +41,6 @@ HELD = wp.constant(-1)  # no friction: three rows that take any impulse (kernels
 # Lanes of a block that works on one environment.
 LANES = 32
 
-# How modules are compiled: on the CPU products and sums are fused where it can (4 to 5 % of a step), as on a GPU, and loops are not
-# vectorised: they run over a few rows or bodies, steps are no slower for it, and compilation takes 6 % less.
-OPTIONS = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -ffp-contract=fast -fno-vectorize"}
-BLOCK_OPTIONS = {**OPTIONS, "block_dim": LANES}
-
 # How a sliding contact is discretised (warp_lcp.Simulator, `sliding`). FACETS keeps the set it sticks with.
 REGULARIZED = wp.constant(0)
 ALIGNED = wp.constant(1)

@@ -25,7 +25,7 @@ def test_the_table_misses_no_kernel():
     for info in pkgutil.iter_modules(warp_lcp.kernels.__path__):
         lines = Path(importlib.import_module(f"warp_lcp.kernels.{info.name}").__file__).read_text().splitlines()
         for line, below in pairwise(lines):
-            if line.strip().startswith("@wp.kernel"):
+            if line.strip().startswith(("@kernel(", "@wp.kernel")):
                 written.add(below.strip().removeprefix("def ").split("(")[0])
     double, single = ({name.split("[")[0] for name in resources.kernels(precision)} for precision in ("float64", "float32"))
     assert written == double

@@ -39,7 +39,7 @@ import warp as wp
 
 from .errors import MissingExtra, WarpLcpError, whole_number
 from .hulls import face_normal
-from .kernels.watch import collect_status
+from .kernels import watch
 from .model import Hull, JointType, Mesh, Model, ShapeType
 from .simulator import INFORMATIVE, Simulator, Status
 
@@ -121,6 +121,8 @@ class RerunLogger:
         self.every = usual if every is None else whole_number("every", every, 1)
         self._ids: Any = None if len(self.envs) == sim.num_envs else wp.array(self.envs, dtype=int, device=sim.device)
         self._seen = wp.zeros(sim.num_envs, dtype=int, device=sim.device)
+        self._collect_status = watch.make()
+        sim._load([self._collect_status])
         self._warned = np.zeros(sim.num_envs, dtype=bool)
         pose, velocity = self._read(sim.body_pose), self._read(sim.body_velocity)
         self._moving = _moving_shapes(model)
@@ -148,7 +150,7 @@ class RerunLogger:
         if not self._streaming:
             return False
         sim = self.sim
-        wp.launch(collect_status, dim=sim.num_envs, inputs=[sim.status, self._seen], device=sim.device)
+        sim._launch(self._collect_status, sim.num_envs, [sim.status, self._seen])
         step = round(sim.time / sim.dt)
         due = not self._last <= step < self._next  # a clock set back starts anew
         if due:

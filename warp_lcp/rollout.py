@@ -63,9 +63,7 @@ class Recorder:
         self.step = wp.zeros((sim.num_envs, self.columns), dtype=int, device=sim.device)
         self.tape = wp.zeros(1, dtype=k.Tape, device=sim.device)
         self.seen_status, self.seen_iterations = (wp.zeros(sim.num_envs, dtype=int, device=sim.device) for _ in range(2))
-        # Before any capture: modules cannot be loaded within one.
-        kernels = [k.apply_wrench, k.record_row, k.add_seen, *([k.apply_control] if sim.model.articulated else [])]
-        wp.force_load(sim.device, modules=[kernel.module for kernel in kernels])
+        sim._load([k.apply_wrench, k.record_row, k.add_seen, *([k.apply_control] if sim.model.articulated else [])])
 
     def run(self, steps: int, wrench: Any, record: Any, every: int, control: Mapping[str, Any] | None) -> Rollout:
         """See Simulator.rollout."""
@@ -99,9 +97,7 @@ class Recorder:
         graph = sim._captured(" ".join(["rollout", *(f.__name__ for f in before)]), lambda: self._step(before))
         for _ in range(steps):
             wp.capture_launch(graph)
-        wp.launch(
-            k.add_seen, dim=sim.num_envs, inputs=[self.seen_status, self.seen_iterations, sim.status, sim.iterations], device=sim.device
-        )
+        sim._launch(k.add_seen, sim.num_envs, [self.seen_status, self.seen_iterations, sim.status, sim.iterations])
         time = sim.time + sim.dt * every * np.arange(1, rows + 1)
         sim._finish(steps)
         return Rollout(time, **arrays)

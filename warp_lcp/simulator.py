@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import enum
-import os
+import gc
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from types import SimpleNamespace
@@ -40,6 +39,7 @@ from .kernels import (
 )
 from .kernels.types import scalar_types
 from .laws import Law
+from .loading import Loading
 from .methods import METHODS, chosen
 from .model import CONVEX, Model, ShapeType
 from .rollout import CONTROLS, Recorder, Rollout
@@ -220,13 +220,22 @@ class Simulator:
     # ---------------------------------------------------------------------------------------------------- stepping
 
     def step(self, count: int = 1) -> None:
-        """Advance every environment by ``count`` steps (0 only prepares)."""
+        """Advance every environment by ``count`` steps (0 only prepares, and waits until every kernel is compiled).
+
+        On the CPU the first steps wait for the kernels that they need alone, while others still compile.
+        """
         count = whole_number("step: count", count, 0)
-        graph = self._captured("step", self._step_kernels)
         self.status.zero_()
         self.iterations.zero_()
-        for _ in range(count):
-            wp.capture_launch(graph)
+        left = count
+        while left and self._loading and self.device.is_cpu:
+            self._step_kernels()
+            self._loading.forget_loaded()
+            left -= 1
+        if left or not count:
+            graph = self._captured("step", self._step_kernels)
+            for _ in range(left):
+                wp.capture_launch(graph)
         self._finish(count)
 
     def rollout(
@@ -284,9 +293,9 @@ class Simulator:
             raise WarpLcpError(f"reset: mask is {mask.shape} of {mask.dtype.__name__}; give ({self.num_envs},) of wp.bool")
         inputs = [mask, self.q0, self.v0, self.q, self.v, self.wrench, self.bodies, self.rows, self.slots]
         inputs += [self.residual, self.residual_energy, self.iterations, self.status]
-        wp.launch(self._kernels.reset, dim=self.num_envs, inputs=inputs, device=self.device)
+        self._launch(self._kernels.reset, self.num_envs, inputs)
         if self.model.articulated:
-            wp.launch(self._kernels.reset_control, dim=self.num_envs, inputs=[mask, *self._targets, self.mechanics], device=self.device)
+            self._launch(self._kernels.reset_control, self.num_envs, [mask, *self._targets, self.mechanics])
 
     # ------------------------------------------------------------------------------------------- parameters and views
 
@@ -356,7 +365,7 @@ class Simulator:
                 setattr(p, name, wp.empty((rows[name], pairs), dtype=dtype, device=self.device))
                 self._graphs.clear()
         inputs = [self.topology, p, self._combine(0)]
-        wp.launch(self._kernels.combine_pairs, dim=(max(rows.values()), pairs), inputs=inputs, device=self.device)
+        self._launch(self._kernels.combine_pairs, (max(rows.values()), pairs), inputs)
 
     def _combine(self, which: int) -> wp.array:
         """[P] how the friction (0) or restitution (1) of a pair's two materials becomes one; none where all take the mean."""
@@ -391,8 +400,7 @@ class Simulator:
             bounces.again = wp.zeros(1, dtype=int, device=self.device)
             self._methods[0].take_rows()
             self._kernels.contact_rows = contacts.make(self.real, self.model.articulated).contact_rows
-            needed = [k.bounce, k.judge, k.settle, self._kernels.contact_rows, self._methods[0].kernel]
-            self._load([kernel for kernel in needed if kernel not in self.kernels])
+            self._load([k.bounce, k.judge, k.settle, self._kernels.contact_rows, self._methods[0].kernel])
             self._graphs.clear()
 
     def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
@@ -472,9 +480,7 @@ class Simulator:
         k, n = articulated.make(self.real), self.model.nv
         if self.trees is None:
             self.trees = articulation.arrays(self, tree.functions(self.real).Trees)
-            self._load([k.kinematics])
-        if k.dynamics not in self.kernels:
-            self._load([k.dynamics])
+        self._load([k.kinematics, k.dynamics])
         scene = [self.topology, self.parameters, self.trees]
         mass, bias = wp.zeros((self.num_envs, n, n), dtype=self.real, device=self.device), self._array(n, self.real)
         self.launch(k.kinematics, [self.q, self.v, *scene, self.bodies])
@@ -522,7 +528,11 @@ class Simulator:
             self.launch(k.bounds, [self.topology, self.bodies, h, lanes], lanes)
             pairs = [self.topology.pairs, self.topology.pair_slots, self._kind_pairs, self._plane_kinds]
             self.launch(k.list_pairs, [*pairs, self.bodies.bounds, self.slots.gap, self.slots.last_feature, self.listed])
+        if self._loading:
+            self._loading.finish([kernel for kind, (kernel, *_) in enumerate(self._pair_kernels) if self._near(kind)])
         for kind, (kernel, number, with_hulls) in enumerate(self._pair_kernels):
+            if kernel in self._loading:
+                continue  # none of its pairs is near
             more, lanes = [self.hulls] if with_hulls else [], self.lanes(number)
             self.launch(kernel, [*scene, self.bodies, self.listed, kind, h, self.slots, *more, lanes], lanes)
         self.reason.zero_()
@@ -564,6 +574,7 @@ class Simulator:
     def _solve_with(self, i: int, todo: wp.array, number: wp.array, status: wp.array) -> None:
         if self._methods[i].judges:
             self.num_doubtful.zero_()
+        self._loading.finish([self._methods[i].kernel])
         self._methods[i].launch(self, todo, number)
         if self._methods[i].judges:
             self._where(self.num_doubtful, lambda: self._certify(i, self.doubtful, self.num_doubtful, status))
@@ -611,7 +622,16 @@ class Simulator:
         environment, because starting one costs 40 ns, for the arguments are copied.
         """
         threads = 1 if self.device.is_cpu else self.num_envs
-        wp.launch(kernel, dim=(threads, width), inputs=[*inputs, threads], device=self.device)
+        self._launch(kernel, (threads, width), [*inputs, threads])
+
+    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list[Any]) -> None:
+        self._loading.finish([kernel])
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+
+    def _near(self, kind: int) -> bool:
+        """Whether pairs of one kind are listed in any environment (kernels/collide.py); read back from the device."""
+        begin_end = self.listed.numpy()[:, kind : kind + 2]
+        return bool((begin_end[:, 1] > begin_end[:, 0]).any())
 
     def lanes(self, number: int) -> int:
         """Threads that share `number` things of an environment: on a GPU one for each, on the CPU one for all."""
@@ -620,6 +640,7 @@ class Simulator:
     def _captured(self, name: str, launches: Callable[[], None]) -> Any:
         """The graph of some launches, captured when first asked for."""
         if name not in self._graphs:
+            self._loading.finish()  # modules cannot be loaded within a capture
             with wp.ScopedCapture(device=self.device) as capture:
                 launches()
             self._graphs[name] = capture.graph
@@ -724,6 +745,7 @@ class Simulator:
             self._loop_system = (wp.zeros((self.num_envs, n, n), dtype=self.real, device=self.device), self._array(n, self.real))
             self._apart: wp.array = wp.zeros(self.num_envs, dtype=self.real, device=self.device)
         self.kernels: list[Any] = []
+        self._loading = Loading(self.device)
         self._load(self._make_kernels())
         for method in self._methods:
             method.prepare(self)
@@ -737,69 +759,81 @@ class Simulator:
             self.hulls, self._meshes = hulls.arrays(self.model, self)  # the latter so that they live as long
 
     def _make_kernels(self) -> Iterator[Any]:
-        methods = chosen(self.method, self.precision, self.law, self.model.articulated)
-        self._methods = [method(self.model, self.real, self.law) for method in methods]
-        yield reset.make(self.real)  # with the first one Warp compiles headers of its own, while the others are made
+        """In the order of need: those that say which pairs are near, what every step needs, then what few steps need or none."""
+        first, *others = chosen(self.method, self.precision, self.law, self.model.articulated)
+        self._methods = [first(self.model, self.real, self.law)]
         self._kernels, self._pair_kernels = stage_kernels(self.model, self.real, self.integrator, self._methods[0].makes_rows)
         if self.project_loops:
             self._kernels.project = projection.make(self.real)
-        for method in self._methods[1:]:
+        stages = dict(vars(self._kernels))
+        resets = [stages.pop(name) for name in ("reset", "reset_control") if name in stages]
+        # With the first one Warp compiles headers of its own, which takes as long as to make the others.
+        yield from (stages.pop(name) for name in ("kinematics", "bounds", "list_pairs") if name in stages)
+        yield self._methods[0].kernel
+        yield from stages.values()
+        for other in others:
+            method = other(self.model, self.real, self.law)
             method.take_rows()
-        yield from (method.kernel for method in reversed(self._methods))  # long ones first
-        yield from dict.fromkeys(kernel for kernel, *_ in self._pair_kernels)
-        yield from (kernel for kernel in vars(self._kernels).values() if kernel is not self._kernels.reset)
+            self._methods.append(method)
+            yield method.kernel
+        yield from (kernel for kernel, *_ in self._pair_kernels)  # a step that finds some of their pairs near asks for them earlier
+        yield from resets
 
     def _load(self, kernels: Iterable[Any]) -> None:
-        """Compile kernels, side by side and while the next are made, and put them on the device."""
+        """Begin to compile kernels that are not there yet, while the next are made, and to put them on the device.
 
-        def load(kernel: Any) -> None:
-            wp.force_load(self.device, modules=[kernel.module], block_dim=kernel.module.options["block_dim"])
-
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            begun = []
+        On the CPU a launch waits for its kernel. A GPU captures steps before it takes the first, with every kernel there.
+        """
+        collects = gc.isenabled()
+        gc.disable()  # syntax trees of all functions live on; to look for garbage among them takes as long as to read a scene
+        try:
             for kernel in kernels:
-                self.kernels.append(kernel)
-                begun.append(pool.submit(load, kernel))
-            for done in begun:
-                done.result()
+                if kernel not in self.kernels:
+                    self.kernels.append(kernel)
+                    self._loading.begin(kernel)
+        finally:
+            if collects:
+                gc.enable()
+        if not self.device.is_cpu:
+            self._loading.finish()
 
 
 def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, bool]]]:
     """Kernels of the stages by name, and (kernel, number of pairs, does it take hulls?) for each kind of pair in the model."""
     rows = contacts.make(real, model.articulated)
     body = articulated.make(real) if model.articulated else bodies.make(real)
-    stages = SimpleNamespace(
-        kinematics=body.kinematics,
-        free_motion=body.free_motion,
-        combine_pairs=rows.combine_pairs,
-        select_contacts=rows.select_contacts,
-        certify=certify.make(real, model.articulated),
-        reset=reset.make(real),
-    )
+    # In the order in which they are compiled: long ones first, so that those that run side by side end together.
+    stages = SimpleNamespace(kinematics=body.kinematics)
     if model.bounded:
         far = collide.pair_functions(real)
         stages.bounds, stages.list_pairs = far.bounds, far.list_pairs
-    if not without_rows:
-        stages.contact_rows = rows.contact_rows
-        if model.articulated and model.bodies_meet:
-            stages.calm_overlaps = rows.calm_overlaps
-    if model.bounces:
-        rebound = restitution.make(real)
-        stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
-    if model.articulated and articulation.rows(model):
-        stages.joint_rows = joint_rows.make(real)
+    stages.free_motion = body.free_motion
     if model.articulated:
         ends = landing.make(real)
-        stages.integrate, stages.reset_control = ends.integrate, body.reset_control
         if integrator == "midpoint":
             stages.drift = ends.drift
         else:
             stages.land = ends.land
+        if articulation.rows(model):
+            stages.joint_rows = joint_rows.make(real)
+        stages.integrate = ends.integrate
     elif integrator == "midpoint":
         motion = integrate.make(real)
         stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
     else:
         stages.integrate = integrate.make(real).integrate
+    stages.certify = certify.make(real, model.articulated)
+    if model.bounces:
+        rebound = restitution.make(real)
+        stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
+    if not without_rows:
+        stages.contact_rows = rows.contact_rows
+        if model.articulated and model.bodies_meet:
+            stages.calm_overlaps = rows.calm_overlaps
+    stages.select_contacts, stages.combine_pairs = rows.select_contacts, rows.combine_pairs
+    stages.reset = reset.make(real)
+    if model.articulated:
+        stages.reset_control = body.reset_control
     pairs = []
     for first, end in pairwise(model.kind_pairs):
         kind = tuple(ShapeType(model.shape_type[s]).name for s in model.pairs[first])
