@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a fresh process to the first step: with a kernel cache that is empty, and with the one that this run has filled (CPU).
+"""From a fresh process to the first step: with a kernel cache that is empty, and with one that an earlier process has filled (CPU).
 
 Robots beside other engines, one after the other on the same cores, and beside a kernel of Warp that does nothing: machines differ by more
 than engines do.
@@ -8,6 +8,7 @@ than engines do.
 from __future__ import annotations
 
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -25,6 +26,8 @@ from .report import ROOT
 from .robot_speed import DT, FILES, VARIANTS
 from .robots import Robot
 
+# Processes of ours that are timed, with an empty cache and with a full one; of others, which take minutes, there is one of each.
+COLD, WARM = 3, 5
 WARP = "Warp"
 # The measure of a machine: import of Warp, its headers and its compiler.
 NOTHING = """
@@ -65,27 +68,30 @@ print("every kernel:", read, len(list(Path(wp.config.kernel_cache_dir).glob("wp_
 
 
 def timed(code: str, *arguments: str) -> tuple[dict[str, float], list[str]]:
-    """Seconds of two processes, from their start until they tell of their first step and of every kernel, and what the second tells."""
-    seconds: dict[str, float] = {}
+    """Seconds from the start of a process until it tells of its first step and of every kernel, and what one tells.
+
+    Medians of so many processes with a cache of their own, and of as many as find one.
+    """
+    seconds: dict[str, list[float]] = {}
     told: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"WARP_CACHE_PATH": str(Path(folder) / "cache"), "PYTHONPATH": str(ROOT)}
-        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python keeps it by default, and then has it in the second process
         program = Path(folder) / "first_step.py"  # Warp reads the source of kernels
         program.write_text(code)
         command = [sys.executable, str(program), *arguments]
-        for state in ("cold", "warm"):
+        for state, i in [*(("cold", i) for i in range(COLD)), *(("warm", 0) for _ in range(WARM))]:
+            environment = os.environ | {"WARP_CACHE_PATH": str(Path(folder) / f"cache{i}"), "PYTHONPATH": str(ROOT)}
+            environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python keeps it by default, and then has it in the next process
             begin = time.perf_counter()
             with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
                 assert process.stdout is not None
                 for line in process.stdout:
                     for words, name in (("first step:", f"{state}_s"), ("every kernel:", f"{state}_all_s")):
                         if line.startswith(words):
-                            seconds[name] = time.perf_counter() - begin
+                            seconds.setdefault(name, []).append(time.perf_counter() - begin)
                             told = line.split()[2:]
             if process.returncode != 0:
                 raise subprocess.CalledProcessError(process.returncode, command)
-    return seconds, told
+    return {name: statistics.median(each) for name, each in seconds.items()}, told
 
 
 def one(name: str, scene: str | Path) -> dict[str, Any]:

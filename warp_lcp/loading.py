@@ -6,8 +6,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import warp as wp
@@ -39,15 +38,17 @@ class Queue:
         with self._lock:
             module, device = key = self._turn.pop(0)
             future = self._unloaded[key]
+        problem = None
         try:
             wp.force_load(device, modules=[module], block_dim=module.options["block_dim"])
         except BaseException as error:
-            future.set_exception(error)
-        else:
-            future.set_result(None)
-        finally:
-            with self._lock:
-                del self._unloaded[key]
+            problem = error
+        with self._lock:
+            del self._unloaded[key]  # whoever asks from now on has it loaded, or tried, once more
+            if problem is None:
+                future.set_result(None)
+            else:
+                future.set_exception(problem)
 
     def hurry(self, futures: Iterable[Future[None]]) -> None:
         """Load these next, if they have not begun."""
@@ -55,10 +56,32 @@ class Queue:
         with self._lock:
             self._turn.sort(key=lambda key: self._unloaded[key] not in wanted)
 
+    def settle(self) -> None:
+        """Wait until nothing is left to load."""
+        with self._lock:
+            left = tuple(self._unloaded.values())
+        wait(left)
 
-@cache
-def _queue(process: int) -> Queue:
-    return Queue()
+
+_queues: dict[int, Queue] = {}
+
+
+def _queue() -> Queue:
+    """That of this process: threads do not survive a fork."""
+    process = os.getpid()
+    if process not in _queues:
+        _queues[process] = Queue()
+    return _queues[process]
+
+
+def _settle_before_a_fork() -> None:
+    # A thread that loads holds locks of Warp and its compiler, which in the new process nobody would give back.
+    if os.getpid() in _queues:
+        _queue().settle()
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(before=_settle_before_a_fork)
 
 
 class Loading:
@@ -69,7 +92,7 @@ class Loading:
         self._begun: dict[wp.Kernel, Future[None]] = {}
 
     def begin(self, kernel: wp.Kernel) -> None:
-        self._begun[kernel] = _queue(os.getpid()).add(kernel, self._device)  # a forked process has threads of its own
+        self._begun[kernel] = _queue().add(kernel, self._device)
 
     def __contains__(self, kernel: wp.Kernel) -> bool:
         """Whether nobody has waited for it yet."""
@@ -84,7 +107,7 @@ class Loading:
             return
         waited = {k: self._begun[k] for k in (tuple(self._begun) if kernels is None else kernels) if k in self._begun}
         if not all(future.done() for future in waited.values()):
-            _queue(os.getpid()).hurry(waited.values())
+            _queue().hurry(waited.values())
         for kernel, future in waited.items():
             del self._begun[kernel]
             future.result()

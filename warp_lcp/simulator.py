@@ -537,7 +537,7 @@ class Simulator:
             self.launch(kernel, [*scene, self.bodies, self.listed, kind, h, self.slots, *more, lanes], lanes)
         self.reason.zero_()
         self.launch(k.select_contacts, [*scene, self.bodies, self.listed, self.slots, h, self.rows, self.status])
-        if not self._methods[0].makes_rows:
+        if not self._methods[0].makes_rows and not self._idle(k.contact_rows, self.rows.count):
             lanes = self.lanes(self.model.max_contacts)
             self.launch(k.contact_rows, [*scene, self.mechanics, self.slots, h, *self.law.row_arguments, self.rows, lanes], lanes)
             if self.model.articulated and self.model.bodies_meet:
@@ -563,7 +563,7 @@ class Simulator:
             for again in range(projection.ROUNDS + 1):
                 self.launch(k.project, [*loops, again, self._apart])
                 self._refresh_bodies()
-        if self.model.articulated and not halves:
+        if self.model.articulated and not halves and not self._idle(k.land, self.mechanics.landing):
             self.launch(k.land, [self.parameters, self.mechanics, self.bodies, h, self.v])
 
     def _solve_kernels(self, todo: wp.array, number: wp.array, status: wp.array) -> None:
@@ -627,6 +627,10 @@ class Simulator:
     def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list[Any]) -> None:
         self._loading.finish([kernel])
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device)
+
+    def _idle(self, kernel: wp.Kernel, work: wp.array) -> bool:
+        """Whether a kernel that may not be loaded yet has nothing to do, for `work` is zero everywhere; read back from the device."""
+        return kernel in self._loading and not work.numpy().any()
 
     def _near(self, kind: int) -> bool:
         """Whether pairs of one kind are listed in any environment (kernels/collide.py); read back from the device."""
@@ -802,27 +806,25 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     """Kernels of the stages by name, and (kernel, number of pairs, does it take hulls?) for each kind of pair in the model."""
     rows = contacts.make(real, model.articulated)
     body = articulated.make(real) if model.articulated else bodies.make(real)
-    # In the order in which they are compiled: long ones first, so that those that run side by side end together.
+    # In the order in which they are compiled: what most steps need, long ones first, then what is for contacts, then the others.
     stages = SimpleNamespace(kinematics=body.kinematics)
     if model.bounded:
         far = collide.pair_functions(real)
         stages.bounds, stages.list_pairs = far.bounds, far.list_pairs
     stages.free_motion = body.free_motion
-    if model.articulated:
-        ends = landing.make(real)
-        if integrator == "midpoint":
-            stages.drift = ends.drift
-        else:
-            stages.land = ends.land
-        if articulation.rows(model):
-            stages.joint_rows = joint_rows.make(real)
-        stages.integrate = ends.integrate
-    elif integrator == "midpoint":
-        motion = integrate.make(real)
-        stages.guard, stages.integrate_midpoint = motion.guard, motion.integrate_midpoint
-    else:
-        stages.integrate = integrate.make(real).integrate
+    if model.articulated and articulation.rows(model):
+        stages.joint_rows = joint_rows.make(real)
+    ends = landing.make(real) if model.articulated else integrate.make(real)
+    if integrator != "midpoint" and model.articulated:
+        stages.land = ends.land
     stages.certify = certify.make(real, model.articulated)
+    if integrator == "midpoint" and not model.articulated:
+        stages.guard, stages.integrate_midpoint = ends.guard, ends.integrate_midpoint
+    else:
+        stages.integrate = ends.integrate
+    if integrator == "midpoint" and model.articulated:
+        stages.drift = ends.drift
+    stages.select_contacts, stages.combine_pairs = rows.select_contacts, rows.combine_pairs
     if model.bounces:
         rebound = restitution.make(real)
         stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
@@ -830,7 +832,6 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         stages.contact_rows = rows.contact_rows
         if model.articulated and model.bodies_meet:
             stages.calm_overlaps = rows.calm_overlaps
-    stages.select_contacts, stages.combine_pairs = rows.select_contacts, rows.combine_pairs
     stages.reset = reset.make(real)
     if model.articulated:
         stages.reset_control = body.reset_control
