@@ -21,7 +21,7 @@ from warp_lcp.kernels import articulated, contact_problem, lcp, projection, reco
 
 import warp_lcp as wl
 from warp_lcp.methods import METHODS
-from warp_lcp.simulator import PRECISIONS
+from warp_lcp.stages import PRECISIONS
 
 ARCHITECTURE = 90
 

@@ -84,7 +84,7 @@ def test_pairs_are_decided_at_load():
 
 def test_only_the_kernels_that_a_scene_needs():
     """A box on a plane compiles no box against box, no sphere, no capsule, and no solver for several bodies."""
-    from warp_lcp.simulator import kernel_names
+    from warp_lcp.stages import kernel_names
 
     names = kernel_names(paper_box())
     assert "plane_box" in names
@@ -95,7 +95,7 @@ def test_only_the_kernels_that_a_scene_needs():
 
 def test_capsules_meet_every_shape():
     """Pairs of a capsule put it second; each kind has its slots, and only kinds that are there get a kernel."""
-    from warp_lcp.simulator import kernel_names
+    from warp_lcp.stages import kernel_names
 
     builder = wl.ModelBuilder()
     capsule = builder.add_capsule(builder.add_body(), 0.1, 0.2)

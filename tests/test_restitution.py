@@ -16,7 +16,7 @@ from conftest import paper_box, random_quaternions, simulator
 import warp_lcp as wl
 from warp_lcp.cli import Tally, ledger
 from warp_lcp.laws import FORMULATIONS
-from warp_lcp.simulator import kernel_names
+from warp_lcp.stages import kernel_names
 
 E = 0.8
 COMPLIANCE = 5e-5

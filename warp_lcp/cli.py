@@ -184,7 +184,7 @@ def ledger(model: Model, law: Law | None = None) -> dict[str, Any]:
     at most (None where the law is none), bytes of one more environment, names of the kernels."""
     from . import articulation, cli_joints
     from .methods import LCP_UNKNOWNS
-    from .simulator import kernel_names
+    from .stages import kernel_names
 
     law = law or Law()
     joint_rows = len(articulation.rows(model)) if model.articulated else 0
