@@ -141,7 +141,16 @@ def measure(others: list[Peer], folder: Path, quick: bool, usd: Path = robots.US
 
 def markdown(rows: list[dict[str, Any]]) -> str:
     """One line a scene and engine."""
-    names = ("scene", "engine", "cold s", "warm s", "every kernel cold s", "warm s", "of which import and USD", "modules compiled")
+    names = (
+        "scene",
+        "engine",
+        "cold s",
+        "warm s",
+        "every kernel cold s",
+        "every kernel warm s",
+        "of which import and USD",
+        "modules compiled",
+    )
     lines = [f"| {' | '.join(names)} | cold, its / ours | cold, its / nothing's |", "|" + " --- |" * 10]
     ours = {r["scene"]: r["cold_s"] for r in rows if r["engine"] == OURS}
     least = next(r["cold_s"] for r in rows if r["engine"] == WARP)

@@ -365,21 +365,14 @@ def combined_by(real):
 
 
 @factory
-def make(real, trees: bool = False) -> SimpleNamespace:
-    """Kernels ``combine_pairs`` (dim N, P), ``select_contacts`` (dim E) and ``contact_rows`` (dim E, lanes).
-
-    trees: ``contact_rows`` for scenes with joints, and ``calm_overlaps`` (dim E, lanes).
-    """
+def selection(real) -> SimpleNamespace:
+    """Kernels ``combine_pairs`` (dim N, P) and ``select_contacts`` (dim E)."""
     t = scalar_types(real)
-    vec3, vec5 = t.vec3, t.vec5
+    vec5 = t.vec5
     Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
     f = row_functions(real)
-    contact_parameters, velocities, mobility = f.contact_parameters, f.velocities, f.mobility
-    expected, read_row, write_row = f.expected, f.read_row, f.write_row
+    contact_parameters, velocities = f.contact_parameters, f.velocities
     combined = combined_by(real)
-    forest = tree.functions(real)
-    halve, product = forest.halve, forest.product
-    Mechanics = forest.Trees if trees else Bodies
 
     @kernel()
     def combine_pairs(topology: Topology, parameters: Parameters, combine: wp.array(dtype=int)):
@@ -546,6 +539,21 @@ def make(real, trees: bool = False) -> SimpleNamespace:
                 count = select(topology, bodies, listed, slots, env, h, fall, True, contacts, status)
             contacts.count[env] = count
 
+    return SimpleNamespace(combine_pairs=combine_pairs, select_contacts=select_contacts)
+
+
+@factory
+def make(real, trees: bool = False) -> SimpleNamespace:
+    """Kernels ``contact_rows`` and with trees, for scenes with joints, ``calm_overlaps``; launch with dim (E, lanes)."""
+    t = scalar_types(real)
+    vec3 = t.vec3
+    Bodies, Contacts, Parameters, Slots, Topology = t.Bodies, t.Contacts, t.Parameters, t.Slots, t.Topology
+    f = row_functions(real)
+    mobility, expected, read_row, write_row = f.mobility, f.expected, f.read_row, f.write_row
+    forest = tree.functions(real)
+    halve, product = forest.halve, forest.product
+    Mechanics = forest.Trees if trees else Bodies
+
     @kernel()
     def contact_rows(
         topology: Topology,
@@ -620,7 +628,7 @@ def make(real, trees: bool = False) -> SimpleNamespace:
                     contacts.free[env, i] = free
                     contacts.shift[env, i] = shift
 
-    kernels = SimpleNamespace(combine_pairs=combine_pairs, select_contacts=select_contacts, contact_rows=contact_rows)
+    kernels = SimpleNamespace(contact_rows=contact_rows)
     if trees:
         kernels.calm_overlaps = calm_overlaps
     return kernels

@@ -22,8 +22,7 @@ OPTIONS = {"cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=nati
 BLOCK_OPTIONS = {**OPTIONS, "block_dim": LANES}  # of kernels whose blocks work on one environment each
 
 _lock = threading.RLock()
-_arguments: list[tuple[Any, ...]] = []  # of the factories that are at work, innermost last
-_names: set[str] = set()
+_at_work: list[tuple[tuple[Any, ...], set[str]]] = []  # arguments of factories, innermost last, and the modules they have made so far
 
 
 def factory(make):
@@ -38,11 +37,11 @@ def factory(make):
         key = tuple(given.arguments.values())
         with _lock:
             if key not in made:
-                _arguments.append(key)
+                _at_work.append((key, set()))
                 try:
                     made[key] = make(*key)
                 finally:
-                    _arguments.pop()
+                    _at_work.pop()
             return made[key]
 
     return once
@@ -52,11 +51,12 @@ def kernel(options=OPTIONS):
     """A kernel of the factory around it, in a module of its own."""
 
     def declare(function):
-        key = (argument.__name__ if isinstance(argument, type) else str(argument) for argument in _arguments[-1])
-        name = ".".join((function.__module__, function.__name__, *key))
-        if name in _names:
+        arguments, names = _at_work[-1]
+        key = (argument.__name__ if isinstance(argument, type) else str(argument) for argument in arguments)
+        name = ".".join((function.__module__, function.__qualname__.replace(".<locals>", ""), *key))
+        if name in names:
             raise NameError(f"there are two kernels {name}")
-        _names.add(name)
+        names.add(name)
         wp.set_module_options(options, module=(module := wp.get_module(name)))
         return wp.kernel(function, module=module, enable_backward=False)
 

@@ -9,37 +9,54 @@ import time
 import numpy as np
 import pytest
 import warp as wp
-from warp_lcp.kernels import watch
+from warp_lcp.kernels import declare, watch
 
 import warp_lcp as wl
 from warp_lcp import loading
 from warp_lcp.loading import Loading, Queue
 
 
-def use_queue_of_its_own(monkeypatch):
-    """One whose threads nobody else needs."""
-    queue = Queue()
-    monkeypatch.setattr(loading, "_queue", lambda: queue)
-    return queue
+@pytest.fixture
+def own_queue(monkeypatch):
+    """A queue whose threads nobody else needs, and nobody else's at work; with as many as a test wants."""
+    loading._queue().settle()
+    made = []
+
+    def use(threads):
+        monkeypatch.setattr("os.cpu_count", lambda: threads)
+        made.append(Queue())
+        monkeypatch.setattr(loading, "_queue", lambda: made[-1])
+        return made[-1]
+
+    yield use
+    for queue in made:
+        queue.settle()
+
+
+def soon(condition):
+    """Wait until it is so."""
+    end = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.001)
 
 
 class Gate:
     """Holds up the loading of some kernels, and tells what began to load."""
 
-    def __init__(self, monkeypatch, *held):
+    def __init__(self, monkeypatch, own_queue, *held):
         self.held, self.begun, self.opened = held, [], threading.Event()
         load = wp.force_load
 
         def wait(device, modules, block_dim=None):
             (module,) = modules
-            self.begun.append(module.name.split(".")[3])
+            self.begun.append(module.name.split(".")[4])
             if self.begun[-1] in self.held:
                 assert self.opened.wait(60.0)
             load(device, modules=modules, block_dim=block_dim)
 
         monkeypatch.setattr(wp, "force_load", wait)
-        monkeypatch.setattr("os.cpu_count", lambda: len(held) + 2)  # threads that are left when all of these wait
-        use_queue_of_its_own(monkeypatch)
+        own_queue(len(held) + 2)  # threads that are left when all of these wait
 
 
 def balls(*heights):
@@ -63,11 +80,11 @@ def state(sim):
     return sim.q.numpy(), sim.v.numpy(), sim.residual.numpy(), sim.iterations.numpy()
 
 
-def test_first_steps_wait_for_no_kernel_that_they_do_not_need(monkeypatch):
+def test_first_steps_wait_for_no_kernel_that_they_do_not_need(monkeypatch, own_queue):
     """Balls too far apart to meet, and a contact that velocity pivoting solves: the same bits as with every kernel there."""
     model = balls(0.11, 1.0)
     expected = moved(model, 100)
-    gate = Gate(monkeypatch, "sphere_sphere", "proximal_contacts", "pgs", "reset")
+    gate = Gate(monkeypatch, own_queue, "sphere_sphere", "proximal_contacts", "pgs", "reset")
     sim = wl.Simulator(model, 2, device="cpu")
     sim.step(100)
     for mine, theirs in zip(state(sim), expected, strict=True):
@@ -94,11 +111,11 @@ def links():
 @pytest.mark.parametrize(
     ("model", "held"), [(balls, "sphere_sphere"), (balls, "pivot"), (balls, "certify"), (balls, "contact_rows"), (links, "land")]
 )
-def test_a_step_waits_for_a_kernel_that_it_needs(monkeypatch, model, held):
+def test_a_step_waits_for_a_kernel_that_it_needs(monkeypatch, own_queue, model, held):
     """Among others for that of pairs once they come near; the answer is the one of a start without waiting."""
     model = model(0.11, 0.35) if model is balls else model()
     expected = moved(model, 200)
-    gate = Gate(monkeypatch, held)
+    gate = Gate(monkeypatch, own_queue, held)
     sim = wl.Simulator(model, 2, device="cpu")
     stepping = threading.Thread(target=sim.step, args=(200,), daemon=True)
     stepping.start()
@@ -111,7 +128,7 @@ def test_a_step_waits_for_a_kernel_that_it_needs(monkeypatch, model, held):
         np.testing.assert_array_equal(mine, theirs)
 
 
-def test_a_step_waits_for_the_next_method_where_the_first_one_fails(monkeypatch):
+def test_a_step_waits_for_the_next_method_where_the_first_one_fails(monkeypatch, own_queue):
     """Contacts so stiff that velocity pivoting cannot certify its answer."""
     model = balls(0.0999)
 
@@ -127,7 +144,7 @@ def test_a_step_waits_for_the_next_method_where_the_first_one_fails(monkeypatch)
     plain.step(0)
     plain.step(1)
     assert plain.queued.numpy()[0] > 0
-    gate = Gate(monkeypatch, "proximal_contacts")
+    gate = Gate(monkeypatch, own_queue, "proximal_contacts")
     sim = spoilt()
     stepping = threading.Thread(target=sim.step, daemon=True)
     stepping.start()
@@ -139,11 +156,10 @@ def test_a_step_waits_for_the_next_method_where_the_first_one_fails(monkeypatch)
         np.testing.assert_array_equal(mine, theirs)
 
 
-def test_what_somebody_waits_for_is_loaded_next(monkeypatch):
+def test_what_somebody_waits_for_is_loaded_next(monkeypatch, own_queue):
     begun, opened = [], threading.Event()
     monkeypatch.setattr(wp, "force_load", lambda device, modules, block_dim: (begun.append(modules[0].name), opened.wait(60.0)))
-    monkeypatch.setattr("os.cpu_count", lambda: 1)
-    queue, cpu = use_queue_of_its_own(monkeypatch), wp.get_device("cpu")
+    queue, cpu = own_queue(1), wp.get_device("cpu")
 
     class Kernel:
         def __init__(self, name):
@@ -153,12 +169,10 @@ def test_what_somebody_waits_for_is_loaded_next(monkeypatch):
     ours = Loading(cpu)
     for kernel in kernels.values():
         ours.begin(kernel)
-    while not begun:
-        time.sleep(0.001)
+    soon(lambda: begun)
     waiting = threading.Thread(target=ours.finish, args=([kernels["d"]],))
     waiting.start()
-    while queue._turn[0][0].name != "d":
-        time.sleep(0.001)
+    soon(lambda: queue._turn[0][0].name == "d")
     opened.set()
     waiting.join()
     assert kernels["d"] not in ours
@@ -168,20 +182,21 @@ def test_what_somebody_waits_for_is_loaded_next(monkeypatch):
     assert not ours
 
 
-def test_a_module_is_loaded_once_for_all_who_wait_and_what_went_wrong_is_told(monkeypatch):
-    tries = []
+def test_a_module_is_loaded_once_for_all_who_wait_and_what_went_wrong_is_told(monkeypatch, own_queue):
+    tries, asked = [], threading.Event()
 
     def fail(device, modules, block_dim):
         tries.append(modules)
-        time.sleep(0.1)
+        assert asked.wait(60.0)
         raise RuntimeError("the compiler is missing")
 
     monkeypatch.setattr(wp, "force_load", fail)
-    use_queue_of_its_own(monkeypatch)
+    own_queue(2)
     kernel = watch.make()
     mine, yours = Loading(wp.get_device("cpu")), Loading(wp.get_device("cpu"))
     for each in (mine, yours):
         each.begin(kernel)
+    asked.set()
     for each in (mine, yours):
         with pytest.raises(RuntimeError, match="the compiler is missing"):
             each.finish([kernel])
@@ -205,3 +220,54 @@ if child == 0:
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=200)
+
+
+def test_a_step_in_a_capture_of_the_user_is_refused(monkeypatch, own_queue):
+    """It could be recorded without what it did not need at that time."""
+    gate = Gate(monkeypatch, own_queue, "pgs")
+    sim = wl.Simulator(balls(0.11), device="cpu")
+    threading.Timer(0.5, gate.opened.set).start()
+    with pytest.raises(RuntimeError, match="capture"), wp.ScopedCapture(device="cpu"):
+        sim.step()
+
+
+def test_loaded_kernels_do_not_wait_behind_others(monkeypatch, own_queue):
+    moved(balls(0.11), 2)
+    gate = Gate(monkeypatch, own_queue, "pgs", "bounds")
+    first = loading._queue()
+    for kernel in wl.Simulator(balls(0.11), device="cpu").kernels:
+        if "pgs" not in kernel.module.name:
+            first.add(kernel, wp.get_device("cpu")).result(60.0)
+    begun = len(gate.begun)
+    wl.Simulator(balls(0.11), device="cpu").step()
+    assert len(gate.begun) == begun
+    gate.opened.set()
+
+
+def test_a_factory_that_was_interrupted_can_be_asked_again():
+    calls = []
+
+    @declare.factory
+    def make(real, twice=False):
+        @declare.kernel()
+        def first(x: wp.array(dtype=real)):
+            x[0] = real(1.0)
+
+        calls.append(real)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+
+        if twice:
+
+            @declare.kernel()
+            def first(x: wp.array(dtype=real)):
+                x[0] = real(2.0)
+
+        return first
+
+    with pytest.raises(KeyboardInterrupt):
+        make(wp.float64)
+    assert make(wp.float64) is make(wp.float64, False) is make(real=wp.float64)
+    assert make(wp.float32) is not make(wp.float64)
+    with pytest.raises(NameError, match="two kernels"):
+        make(wp.float64, True)

@@ -22,12 +22,17 @@ class Queue:
         self._threads = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="warp_lcp")
         self._lock = threading.Lock()
         self._unloaded: dict[tuple[Any, str], Future[None]] = {}
+        self._loaded: set[tuple[Any, str]] = set()
         self._turn: list[tuple[Any, str]] = []
 
     def add(self, kernel: wp.Kernel, device: wp.Device) -> Future[None]:
         """Done once the kernel can be launched without compiling anything."""
         with self._lock:
             key = kernel.module, device.alias
+            if key in self._loaded:
+                done: Future[None] = Future()
+                done.set_result(None)
+                return done
             if key not in self._unloaded:
                 self._unloaded[key] = Future()
                 self._turn.append(key)
@@ -44,8 +49,9 @@ class Queue:
         except BaseException as error:
             problem = error
         with self._lock:
-            del self._unloaded[key]  # whoever asks from now on has it loaded, or tried, once more
+            del self._unloaded[key]  # where there was a problem, whoever asks from now on has it tried once more
             if problem is None:
+                self._loaded.add(key)
                 future.set_result(None)
             else:
                 future.set_exception(problem)
@@ -69,9 +75,7 @@ _queues: dict[int, Queue] = {}
 def _queue() -> Queue:
     """That of this process: threads do not survive a fork."""
     process = os.getpid()
-    if process not in _queues:
-        _queues[process] = Queue()
-    return _queues[process]
+    return _queues[process] if process in _queues else _queues.setdefault(process, Queue())
 
 
 def _settle_before_a_fork() -> None:
@@ -92,7 +96,9 @@ class Loading:
         self._begun: dict[wp.Kernel, Future[None]] = {}
 
     def begin(self, kernel: wp.Kernel) -> None:
-        self._begun[kernel] = _queue().add(kernel, self._device)
+        future = _queue().add(kernel, self._device)
+        if not future.done() or future.exception() is not None:
+            self._begun[kernel] = future
 
     def __contains__(self, kernel: wp.Kernel) -> bool:
         """Whether nobody has waited for it yet."""
@@ -109,7 +115,8 @@ class Loading:
         if not all(future.done() for future in waited.values()):
             _queue().hurry(waited.values())
         for kernel, future in waited.items():
-            del self._begun[kernel]
+            wait([future])
+            del self._begun[kernel]  # not before: who interrupts this has to wait for it again
             future.result()
 
     def forget_loaded(self) -> None:

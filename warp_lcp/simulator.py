@@ -207,13 +207,14 @@ class Simulator:
     def step(self, count: int = 1) -> None:
         """Advance every environment by ``count`` steps (0 only prepares, and waits until every kernel is compiled).
 
-        On the CPU the first steps wait for the kernels that they need alone, while others still compile.
+        On the CPU the first steps wait for the kernels that they need alone, while others still compile. (Interrupted there, or where a
+        kernel does not compile, a step is left half done: reset.)
         """
         count = whole_number("step: count", count, 0)
         self.status.zero_()
         self.iterations.zero_()
         left = count
-        while left and self._loading and self.device.is_cpu:
+        while left and self._loading and self.device.is_cpu and not self.device.is_capturing:
             self._step_kernels()
             self._loading.forget_loaded()
             left -= 1
@@ -497,7 +498,7 @@ class Simulator:
             )
 
     def _step_kernels(self) -> None:
-        """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back."""
+        """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back; there is one while kernels load."""
         k, h, b, scene = self._kernels, self.dt, self.model.num_bodies, [self.topology, self.parameters]
         halves = self.integrator == "midpoint" and not self._averages
         self._refresh_bodies()

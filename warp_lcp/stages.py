@@ -38,7 +38,7 @@ PRECISIONS = {"float64": (wp.float64, np.float64), "float32": (wp.float32, np.fl
 
 def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) -> tuple[SimpleNamespace, list[tuple[Any, int, bool]]]:
     """Kernels of the stages by name, and (kernel, number of pairs, does it take hulls?) for each kind of pair in the model."""
-    rows = contacts.make(real, model.articulated)
+    selected, rows = contacts.selection(real), contacts.make(real, model.articulated)
     body = articulated.make(real) if model.articulated else bodies.make(real)
     # In the order in which they are compiled: what most steps need, long ones first, then what is for contacts, then the others.
     stages = SimpleNamespace(kinematics=body.kinematics)
@@ -58,7 +58,7 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         stages.integrate = ends.integrate
     if integrator == "midpoint" and model.articulated:
         stages.drift = ends.drift
-    stages.select_contacts, stages.combine_pairs = rows.select_contacts, rows.combine_pairs
+    stages.select_contacts, stages.combine_pairs = selected.select_contacts, selected.combine_pairs
     if model.bounces:
         rebound = restitution.make(real)
         stages.bounce, stages.judge, stages.settle = rebound.bounce, rebound.judge, rebound.settle
