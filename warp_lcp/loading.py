@@ -21,52 +21,46 @@ class Queue:
     def __init__(self) -> None:
         self._threads = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="warp_lcp")
         self._lock = threading.Lock()
-        self._unloaded: dict[tuple[Any, str], Future[None]] = {}
-        self._loaded: set[tuple[Any, str]] = set()
+        self._asked: dict[tuple[Any, str], Future[None]] = {}
         self._turn: list[tuple[Any, str]] = []
 
     def add(self, kernel: wp.Kernel, device: wp.Device) -> Future[None]:
         """Done once the kernel can be launched without compiling anything."""
         with self._lock:
             key = kernel.module, device.alias
-            if key in self._loaded:
-                done: Future[None] = Future()
-                done.set_result(None)
-                return done
-            if key not in self._unloaded:
-                self._unloaded[key] = Future()
+            if key not in self._asked:
+                self._asked[key] = Future()
                 self._turn.append(key)
                 self._threads.submit(self._load_next)
-            return self._unloaded[key]
+            return self._asked[key]
 
     def _load_next(self) -> None:
         with self._lock:
             module, device = key = self._turn.pop(0)
-            future = self._unloaded[key]
+            future = self._asked[key]
         problem = None
         try:
             wp.force_load(device, modules=[module], block_dim=module.options["block_dim"])
         except BaseException as error:
             problem = error
         with self._lock:
-            del self._unloaded[key]  # where there was a problem, whoever asks from now on has it tried once more
             if problem is None:
-                self._loaded.add(key)
                 future.set_result(None)
             else:
+                del self._asked[key]  # whoever asks from now on has it tried once more
                 future.set_exception(problem)
 
     def hurry(self, futures: Iterable[Future[None]]) -> None:
         """Load these next, if they have not begun."""
         wanted = set(futures)
         with self._lock:
-            self._turn.sort(key=lambda key: self._unloaded[key] not in wanted)
+            self._turn.sort(key=lambda key: self._asked[key] not in wanted)
 
     def settle(self) -> None:
         """Wait until nothing is left to load."""
         with self._lock:
-            left = tuple(self._unloaded.values())
-        wait(left)
+            asked = tuple(self._asked.values())
+        wait(asked)
 
 
 _queues: dict[int, Queue] = {}
