@@ -68,7 +68,7 @@ def scenes() -> list[wl.Model]:
 def kernels(precision: str) -> dict[str, wp.Kernel]:
     """Every kernel of one precision by its name; a kernel's instances after the first as name[what it is built for]."""
     real = PRECISIONS[precision][0]
-    found = {"collect_status": watch.make(), "solve_contacts": contact_problem.make(real)}
+    found = {"collect_status": watch.make(), "add_seen": record.make_sum(), "solve_contacts": contact_problem.make(real)}
     found |= {name: part for name, part in vars(record.make(real)).items() if isinstance(part, wp.Kernel)}
     found |= {"dynamics": articulated.make(real).dynamics, "project": projection.make(real)}
     found |= {f"solve_batch[{method}]": solve_batch.make(real, method) for method in solve_batch.SOLVERS}

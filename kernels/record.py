@@ -15,7 +15,7 @@ from .types import scalar_types
 
 @factory
 def make(real) -> SimpleNamespace:
-    """The struct ``Tape`` and kernels ``apply_wrench``, ``apply_control``, ``record_row`` and ``add_seen``."""
+    """The struct ``Tape`` and kernels ``apply_wrench``, ``apply_control`` and ``record_row``."""
     t = scalar_types(real)
     transform, spatial, Bodies = t.transform, t.spatial, t.Bodies
 
@@ -121,6 +121,13 @@ def make(real) -> SimpleNamespace:
                 status[env] = 0
                 iterations[env] = 0
 
+    return SimpleNamespace(Tape=Tape, apply_wrench=apply_wrench, apply_control=apply_control, record_row=record_row)
+
+
+@factory
+def make_sum():
+    """Kernel ``add_seen``; launch with dim E."""
+
     @kernel()
     def add_seen(
         seen_status: wp.array(dtype=int),
@@ -128,9 +135,9 @@ def make(real) -> SimpleNamespace:
         status: wp.array(dtype=int),
         iterations: wp.array(dtype=int),
     ):
-        """Status and iterations of the whole rollout, from the rows and what came after the last of them; dim (E)."""
+        """Status and iterations of the whole rollout, from the rows and what came after the last of them."""
         env = wp.tid()
         status[env] = status[env] | seen_status[env]
         iterations[env] = iterations[env] + seen_iterations[env]
 
-    return SimpleNamespace(Tape=Tape, apply_wrench=apply_wrench, apply_control=apply_control, record_row=record_row, add_seen=add_seen)
+    return add_seen

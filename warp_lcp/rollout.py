@@ -58,12 +58,13 @@ class Recorder:
     def __init__(self, sim: Simulator):
         self.sim = sim
         self.kernels = k = recording.make(sim.real)
+        self.add_seen = recording.make_sum()
         # Threads that share a row; on the CPU, where a row is contiguous, one walks over it.
         self.columns = 1 if sim.device.is_cpu else max(sim.model.nq, sim.model.nv, sim.model.num_bodies)
         self.step = wp.zeros((sim.num_envs, self.columns), dtype=int, device=sim.device)
         self.tape = wp.zeros(1, dtype=k.Tape, device=sim.device)
         self.seen_status, self.seen_iterations = (wp.zeros(sim.num_envs, dtype=int, device=sim.device) for _ in range(2))
-        sim._load([k.apply_wrench, k.record_row, k.add_seen, *([k.apply_control] if sim.model.articulated else [])])
+        sim._load([k.apply_wrench, k.record_row, self.add_seen, *([k.apply_control] if sim.model.articulated else [])])
 
     def run(self, steps: int, wrench: Any, record: Any, every: int, control: Mapping[str, Any] | None) -> Rollout:
         """See Simulator.rollout."""
@@ -97,7 +98,7 @@ class Recorder:
         graph = sim._captured(" ".join(["rollout", *(f.__name__ for f in before)]), lambda: self._step(before))
         for _ in range(steps):
             wp.capture_launch(graph)
-        sim._launch(k.add_seen, sim.num_envs, [self.seen_status, self.seen_iterations, sim.status, sim.iterations])
+        sim._launch(self.add_seen, sim.num_envs, [self.seen_status, self.seen_iterations, sim.status, sim.iterations])
         time = sim.time + sim.dt * every * np.arange(1, rows + 1)
         sim._finish(steps)
         return Rollout(time, **arrays)
