@@ -60,32 +60,41 @@ def pair_functions(real) -> SimpleNamespace:
         return wp.abs(x[0]) + wp.abs(x[1]) + wp.abs(x[2])
 
     @wp.func
-    def far_apart(a: vec4, b: vec4) -> bool:
-        """Are two shapes further apart than ``reach`` allows for, by their bounds? Not all that are are found."""
-        d = vec3(b[0] - a[0], b[1] - a[1], b[2] - a[2])
-        far = a[3] + b[3]
-        return wp.length_sq(d) >= far * far
+    def far_apart(a: spatial, b: spatial) -> bool:
+        """Are two shapes further apart along an axis of the world than ``reach`` allows for, by their bounds?"""
+        return (
+            wp.abs(a[0] - b[0]) >= a[3] + b[3] or wp.abs(a[1] - b[1]) >= a[4] + b[4] or wp.abs(a[2] - b[2]) >= a[5] + b[5]
+        )
 
     @kernel()
-    def bounds(topology: Topology, bodies: Bodies, h: real, lanes: int, stride: int):
-        """Centre of every shape, and at least its radius + ``reach``, without a root; of the world's once."""
+    def bounds(topology: Topology, extent: wp.array(dtype=vec4), bodies: Bodies, h: real, lanes: int, stride: int):
+        """Centre of every shape, and how far it extends along the axes of the world, with at least its ``reach``; of the world's once.
+
+        extent: Model.shape_extent.
+        """
         start, lane = wp.tid()
         for env in range(start, bodies.bounds.shape[0], stride):
             for shape in range(lane, bodies.bounds.shape[1], lanes):
                 body = topology.shape_body[shape]
                 if body < 0 and bodies.bounds[env, shape][3] > real(0.0):
                     continue
-                radius = sum_norm(topology.shape_size[shape])
-                centre = wp.transform_get_translation(topology.shape_pose[shape])
-                far = real(1.02) * radius + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
+                half = extent[shape]
+                radius = sum_norm(vec3(half[0], half[1], half[2])) + half[3]
+                pose = topology.shape_pose[shape]
+                far = real(0.02) * radius + half[3] + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
                 if body >= 0:
-                    centre = wp.transform_point(bodies.pose[env, body], centre)
+                    pose = wp.transform_multiply(bodies.pose[env, body], pose)
                     twist = bodies.free_velocity[env, body]
-                    lever = radius + sum_norm(centre - bodies.com[env, body])
+                    lever = radius + sum_norm(wp.transform_get_translation(pose) - bodies.com[env, body])
                     far += real(2.0) * h * (sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
                     if bodies.alert.shape[0] > 0:
                         far += real(2.0) * h * bodies.alert[env]
-                bodies.bounds[env, shape] = vec4(centre[0], centre[1], centre[2], far)
+                centre = wp.transform_get_translation(pose)
+                R = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+                x = wp.abs(R[0, 0]) * half[0] + wp.abs(R[0, 1]) * half[1] + wp.abs(R[0, 2]) * half[2]
+                y = wp.abs(R[1, 0]) * half[0] + wp.abs(R[1, 1]) * half[1] + wp.abs(R[1, 2]) * half[2]
+                z = wp.abs(R[2, 0]) * half[0] + wp.abs(R[2, 1]) * half[1] + wp.abs(R[2, 2]) * half[2]
+                bodies.bounds[env, shape] = spatial(centre[0], centre[1], centre[2], x + far, y + far, z + far)
 
     @kernel()
     def list_pairs(
@@ -93,7 +102,7 @@ def pair_functions(real) -> SimpleNamespace:
         pair_slots: wp.array(dtype=int),
         kind_pairs: wp.array(dtype=int),
         first: int,
-        bounds: wp.array2d(dtype=vec4),
+        bounds: wp.array2d(dtype=spatial),
         gap: wp.array2d(dtype=real),
         last_feature: wp.array2d(dtype=int),
         listed: wp.array2d(dtype=int),

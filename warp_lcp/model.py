@@ -489,6 +489,21 @@ class Model:
         return bool((self.shape_type[self.pairs] != ShapeType.PLANE).all(axis=-1).any())
 
     @property
+    def shape_extent(self) -> np.ndarray:
+        """[S, 4] half extents of a box in each shape's frame, and the radius of a ball: carried through the box it holds the shape, m."""
+        extent = np.zeros((len(self.shape_type), 4))
+        for out, kind, size in zip(extent, self.shape_type, self.shape_size, strict=True):
+            if kind == ShapeType.SPHERE:
+                out[3] = size[0]
+            elif kind == ShapeType.CAPSULE:
+                out[2], out[3] = size[1], size[0]
+            elif kind in (ShapeType.CYLINDER, ShapeType.CONE):
+                out[:3] = size[0], size[0], size[1]
+            elif kind != ShapeType.PLANE:
+                out[:3] = size
+        return extent
+
+    @property
     def bodies_meet(self) -> bool:
         """Can two free bodies touch?"""
         return bool(self.movable[self.shape_body[self.pairs]].all(axis=-1).any())

@@ -511,7 +511,7 @@ class Simulator:
             self.launch(k.free_motion, [*scene, self.wrench, h, self.bodies], b)
         if self.model.bounded:
             lanes = self.lanes(len(self.model.shape_body))
-            self.launch(k.bounds, [self.topology, self.bodies, h, lanes], lanes)
+            self.launch(k.bounds, [self.topology, self._extent, self.bodies, h, lanes], lanes)
             pairs = [self.topology.pairs, self.topology.pair_slots, self._kind_pairs, self._plane_kinds]
             self.launch(k.list_pairs, [*pairs, self.bodies.bounds, self.slots.gap, self.slots.last_feature, self.listed])
         if self._loading:
@@ -680,7 +680,8 @@ class Simulator:
         bundle.pose, bundle.velocity = self._array(b, t.transform), self._array(b, t.spatial)
         bundle.com, bundle.inv_mass, bundle.inv_inertia = self._array(b, t.vec3), self._array(b, self.real), self._array(b, t.mat33)
         bundle.free_velocity = self._array(b, t.spatial)
-        bundle.bounds = self._array(len(m.shape_body) if m.bounded else 0, t.vec4)
+        bundle.bounds = self._array(len(m.shape_body) if m.bounded else 0, t.spatial)
+        self._extent = self._constant(m.shape_extent, t.vec4)
         bundle.hit = self._array(b if m.bodies_meet else 0, self.real)
         bundle.alert = wp.zeros(e if m.bodies_meet else 0, dtype=self.real, device=self.device)
         self.next_velocity = self._array(b, t.spatial)

@@ -40,7 +40,7 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     """Kernels of the stages by name, and (kernel, number of pairs, does it take hulls?) for each kind of pair in the model."""
     selected, rows = contacts.selection(real), contacts.make(real, model.articulated)
     body = articulated.make(real) if model.articulated else bodies.make(real)
-    # In the order in which they are compiled: what most steps need, long ones first, then what is for contacts, then the others.
+    # In the order in which they are compiled: what every step needs, long ones first, then what contacts need, then the others.
     stages = SimpleNamespace(kinematics=body.kinematics)
     if model.bounded:
         far = collide.pair_functions(real)
@@ -49,8 +49,6 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
     if model.articulated and articulation.rows(model):
         stages.joint_rows = joint_rows.make(real)
     ends = landing.make(real) if model.articulated else integrate.make(real)
-    if integrator != "midpoint" and model.articulated:
-        stages.land = ends.land
     stages.certify = certify.make(real, model.articulated)
     if integrator == "midpoint" and not model.articulated:
         stages.guard, stages.integrate_midpoint = ends.guard, ends.integrate_midpoint
@@ -66,6 +64,8 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         stages.contact_rows = rows.contact_rows
         if model.articulated and model.bodies_meet:
             stages.calm_overlaps = rows.calm_overlaps
+    if integrator != "midpoint" and model.articulated:
+        stages.land = ends.land
     stages.reset = reset.make(real)
     if model.articulated:
         stages.reset_control = body.reset_control
