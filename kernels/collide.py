@@ -62,9 +62,7 @@ def pair_functions(real) -> SimpleNamespace:
     @wp.func
     def far_apart(a: spatial, b: spatial) -> bool:
         """Are two shapes further apart along an axis of the world than ``reach`` allows for, by their bounds?"""
-        return (
-            wp.abs(a[0] - b[0]) >= a[3] + b[3] or wp.abs(a[1] - b[1]) >= a[4] + b[4] or wp.abs(a[2] - b[2]) >= a[5] + b[5]
-        )
+        return wp.abs(a[0] - b[0]) >= a[3] + b[3] or wp.abs(a[1] - b[1]) >= a[4] + b[4] or wp.abs(a[2] - b[2]) >= a[5] + b[5]
 
     @kernel()
     def bounds(topology: Topology, extent: wp.array(dtype=vec4), bodies: Bodies, h: real, lanes: int, stride: int):

@@ -102,7 +102,7 @@ def scalar_types(real) -> SimpleNamespace:
         inv_mass: wp.array2d(dtype=real)  # [E, B] zero where forces do not move the body
         inv_inertia: wp.array2d(dtype=mat33)  # [E, B] world axes, zero likewise
         free_velocity: wp.array2d(dtype=spatial)  # [E, B] v + h M^-1 (f_a - c)
-        bounds: wp.array2d(dtype=spatial)  # [E, S | 0] centre of a shape, and how far it can reach along each axis (collide.py); 0 without pairs
+        bounds: wp.array2d(dtype=spatial)  # [E, S | 0] centre of a shape, reach along each axis (collide.py); 0 without pairs
         # Where no two free bodies can touch neither is there.
         hit: wp.array2d(dtype=real)  # [E, B | 0] speed that the body may take on in the step from what hits it, m/s
         alert: wp.array(dtype=real)  # [E | 0] fastest approach of what hits something in this step or the next, m/s

@@ -178,7 +178,7 @@ def test_pairs_count_as_far_only_where_no_point_could_get_a_row():
 def test_shapes_are_within_their_bounds(shape):
     """Points of each shape, turned at random, are within its bounds; balls, boxes and capsules reach nearly as far as these.
 
-    (Bounds are wider by 2 % of the sum of half extents and the radius, and points of balls are sampled. Other shapes are bounded as their boxes.)
+    (Bounds are wider by 2 % of the sum of half extents and the radius, points of balls are sampled. Others are bounded as their boxes.)
     """
     rng, envs = np.random.default_rng(3), 50
     corners = rng.normal(size=(20, 3))

@@ -11,7 +11,22 @@ import numpy as np
 
 from . import joints as geometry
 from .errors import ModelError
-from .joints import AXES, Joint, acts, columns, compose, coordinates, directions, inverse, kinds, mass_matrix, pose_of, rotate, turned
+from .joints import (
+    AXES,
+    Joint,
+    acts,
+    columns,
+    compose,
+    coordinates,
+    cross,
+    directions,
+    inverse,
+    kinds,
+    mass_matrix,
+    pose_of,
+    rotate,
+    turned,
+)
 from .model import DofKind, JointType, Loop, parents_first
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -205,14 +220,14 @@ class Arrangement:
         self.dof_names += [body.name] * 6
         self.dofs += [(b, kind, np.eye(3)[k % 3], 0.0, 0.0, 0.0, NO_LIMIT, NO_DRIVE) for k in range(6)]
         centre = body.pose[:3] + rotate(body.pose[3:], self.com[b])
-        turns = np.r_[np.cross(centre, np.eye(3)).T, np.eye(3)]
+        turns = np.r_[cross(centre, np.eye(3)).T, np.eye(3)]
         self.axes.append(np.c_[np.eye(6, 3), turns] if kind is DofKind.FREE else np.zeros((6, 6)))
         self.twists[b] = self._asked_twist(b, body.pose)
 
     def _asked_twist(self, b: int, pose: np.ndarray) -> np.ndarray:
         body = self.bodies[b]
         centre = pose[:3] + rotate(pose[3:], self.com[b])
-        return np.r_[body.velocity + np.cross(centre, body.angular_velocity), body.angular_velocity]
+        return np.r_[body.velocity + cross(centre, body.angular_velocity), body.angular_velocity]
 
     def _hang(self, b: int, joint: Joint) -> None:
         """A body on the joint that carries it, at the coordinates nearest to where it was said to stand unless it has others."""

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from .errors import ModelError
-from .joints import compose, inverse, multiply, rotate
+from .joints import compose, cross, inverse, multiply, rotate
 from .model import Drive, Ignored, JointType
 from .usd_attributes import neutral, written
 
@@ -279,7 +279,7 @@ class JointReader:
         for axis in axes:
             ways = np.array([rotate(axis.frame[3:], e) for e in np.eye(3)]) if axis.letter == "ball" else [axis.direction]
             for way in ways:
-                twists.append(np.r_[way, np.zeros(3)] if axis.letter == "t" else np.r_[np.cross(axis.frame[:3], way), way])
+                twists.append(np.r_[way, np.zeros(3)] if axis.letter == "t" else np.r_[cross(axis.frame[:3], way), way])
         heavy = all(np.all(np.asarray(axis.options.get("armature", 0.0)) > 0.0) for axis in axes)
         if np.linalg.matrix_rank(np.array(twists), tol=1e-6) < len(twists) and not heavy:
             names = some([axis.name for axis in axes])
