@@ -247,11 +247,17 @@ def make(real) -> SimpleNamespace:
         parameters: Parameters,
         trees: Trees,
         bodies: Bodies,
+        some: wp.array(dtype=int),
         stride: int,
     ):
-        """Poses, axes and velocities, from the roots to the leaves."""
+        """Poses, axes and velocities, from the roots to the leaves, of environments where some [E] is not zero; of all if it is empty."""
         start, _ = wp.tid()
         for env in range(start, q.shape[0], stride):
+            asked = bool(True)
+            if some.shape[0] > 0:
+                asked = some[env] != 0
+            if not asked:
+                continue
             for k_b in range(trees.order.shape[0]):
                 b = trees.order[k_b]
                 parent = trees.parent[b]

@@ -148,7 +148,9 @@ def make(real) -> SimpleNamespace:
                     for i in range(trees.first[b], trees.end[b]):
                         trees.free[env, i] = trees.left[env, i]  # it is not expected to be hit again
             # Not by the midpoint rule, which has moved by half a step only.
-            if landing and part == real(1.0):
+            landing = landing and part == real(1.0)
+            trees.lands[env] = int(landing)
+            if landing:
                 # h M^-1 c, and what it is worth of the impulses along joints.
                 for i in range(trees.before.shape[0]):
                     trees.change[env, i] = real(0.0)
@@ -162,12 +164,10 @@ def make(real) -> SimpleNamespace:
 
     @kernel()
     def land(parameters: Parameters, trees: Trees, bodies: Bodies, h: real, v: wp.array2d(dtype=real), stride: int):
-        """v, and the velocities of bodies, at q+ of what was hit."""
+        """v at q+ of what was hit, after kinematics there; those of bodies are for the next kinematics."""
         start, _ = wp.tid()
         for env in range(start, v.shape[0], stride):
-            landing = bool(False)
-            for b in range(trees.order.shape[0]):
-                landing = landing or (trees.root[b] == b and trees.landing[env, b] > 0)
+            landing = trees.lands[env] != 0
             if landing:
                 inertias(parameters, trees, bodies, env)
                 for b in range(trees.order.shape[0]):
@@ -200,9 +200,6 @@ def make(real) -> SimpleNamespace:
                     v[env, i] = after
                     trees.left[env, i] = after
                     trees.free[env, i] = trees.free[env, i] + trees.change[env, i]  # no row did it
-                for b in range(trees.order.shape[0]):
-                    trees.twist[env, b] = trees.twist[env, b] + trees.gained[env, b]
-                    bodies.velocity[env, b] = bodies.velocity[env, b] + gain(trees, bodies, env, b)
 
     @kernel()
     def drift(

@@ -125,7 +125,8 @@ def functions(real) -> SimpleNamespace:
         left: wp.array2d(dtype=real)  # [E, V] v as the step before left it
         bent: wp.array2d(dtype=spatial)  # [E, B] momentum that c takes from a body in a step, about its centre of mass
         momentum: wp.array2d(dtype=spatial)  # [E, B] what it goes on with where something was hit
-        # Of a tree, at its root (kernels/landing.py):
+        lands: wp.array(dtype=int)  # [E] may a tree have to land (kernels/landing.py)?
+        # Of a tree, at its root:
         landing: wp.array2d(dtype=int)  # [E, B] was it hit, or turned by too much?
         allowed: wp.array2d(dtype=real)  # [E, B] twice the energy of motion that it may have at q+
         worth: wp.array2d(dtype=vec2)  # [E, B] twice the energy of motion, and the same of a change of momenta

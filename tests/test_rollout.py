@@ -101,10 +101,11 @@ def test_wrenches_in_every_form():
 
 
 def test_rollouts_share_a_graph_and_no_arrays(monkeypatch):
-    """The second rollout captures nothing, whatever it records, and leaves the arrays of the first alone."""
+    """The next rollouts capture nothing, whatever they record, and leave the arrays of the first alone. Those of bodies have a graph."""
     sim = randomised(3)
     first = sim.rollout(20)
     kept = first.q.numpy().copy()
+    sim.rollout(1, record="body_velocity")
 
     def refuse(*_, **__):
         raise AssertionError("captured again")
@@ -115,6 +116,7 @@ def test_rollouts_share_a_graph_and_no_arrays(monkeypatch):
     assert second.q.shape == (7, 3, 7)
     assert second.q.is_contiguous
     assert second.v is None
+    assert sim.rollout(1, record=("residual", "iterations")).q is None
     with pytest.raises(AssertionError, match="captured again"):
         sim.rollout(20, pushes(20, 3))  # with wrenches it is another step
 

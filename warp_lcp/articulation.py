@@ -67,7 +67,7 @@ def arrays(sim: Any, Trees: Any) -> Any:
     trees.row_length = sim._constant(np.array([row.length for row in table]), real)
     trees.row_drive = sim._constant(np.array([row.drive for row in table]).reshape(1, -1, 3), t.vec3)
     trees.row_friction = sim._constant(np.array([row.friction for row in table])[None], real)
-    trees.touching = wp.zeros(sim.num_envs, dtype=int, device=sim.device)
+    trees.touching, trees.lands = (wp.zeros(sim.num_envs, dtype=int, device=sim.device) for _ in range(2))
     for name, number, dtype in layout(model, real):
         setattr(trees, name, sim._array(number, dtype))
     trees.target.assign(np.tile(drive[:, 3], (sim.num_envs, 1)))

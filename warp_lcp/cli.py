@@ -221,7 +221,7 @@ def bytes_per_env(model: Model, law: Law | None = None) -> int:
     total += 4 * (len(methods) + any(method.judges for method in methods))  # lists of environments
     total += 4 * (len(model.kind_pairs) + len(model.pairs))  # list of pairs
     if model.articulated:
-        total += 4 + sum(number * wp.types.type_size_in_bytes(dtype) for _, number, dtype in articulation.layout(model, wp.float64))
+        total += 2 * 4 + sum(number * wp.types.type_size_in_bytes(dtype) for _, number, dtype in articulation.layout(model, wp.float64))
     for bundle, width in widths.items():
         for name, variable in bundle.vars.items():
             if not isinstance(variable.type, wp.array):  # a number

@@ -95,9 +95,11 @@ class Recorder:
 
         before: list[Callable[[], None]] = [self._push] if wrench is not None else []
         before += [self._drive] if control else []
-        graph = sim._captured(" ".join(["rollout", *(f.__name__ for f in before)]), lambda: self._step(before))
+        after: list[Callable[[], None]] = [sim._refresh_bodies] if {"body_pose", "body_velocity"} & set(names) else []
+        graph = sim._captured(" ".join(["rollout", *(f.__name__ for f in (*before, *after))]), lambda: self._step(before, after))
         for _ in range(steps):
             wp.capture_launch(graph)
+        sim._refresh_bodies()
         sim._launch(self.add_seen, sim.num_envs, [self.seen_status, self.seen_iterations, sim.status, sim.iterations])
         time = sim.time + sim.dt * every * np.arange(1, rows + 1)
         sim._finish(steps)
@@ -111,11 +113,13 @@ class Recorder:
         inputs = [self.tape, self.step, control.position, control.velocity, control.force]
         self.sim.launch(self.kernels.apply_control, inputs, self.sim.model.nv)
 
-    def _step(self, before: list[Callable[[], None]]) -> None:
+    def _step(self, before: list[Callable[[], None]], after: list[Callable[[], None]]) -> None:
         sim = self.sim
         for launch in before:
             launch()
         sim._step_kernels()
+        for launch in after:
+            launch()
         state = [sim.q, sim.v, sim.bodies, sim.status, sim.iterations, sim.residual, sim.residual_energy]
         seen = [self.seen_status, self.seen_iterations]
         sim.launch(self.kernels.record_row, [self.tape, self.step, *state, *seen, self.columns], self.columns)

@@ -215,13 +215,13 @@ class Simulator:
         self.iterations.zero_()
         left = count
         while left and self._loading and self.device.is_cpu and not self.device.is_capturing:
-            self._step_kernels()
-            self._loading.forget_loaded()
             left -= 1
+            (self._step_kernels if left else self._last_step)()
+            self._loading.forget_loaded()
         if left or not count:
-            graph = self._captured("step", self._step_kernels)
-            for _ in range(left):
-                wp.capture_launch(graph)
+            on, last = self._captured("step", self._step_kernels), self._captured("last step", self._last_step)
+            for i in range(left):
+                wp.capture_launch(on if i + 1 < left else last)
         self._finish(count)
 
     def rollout(
@@ -235,8 +235,8 @@ class Simulator:
         """Advance every environment by ``steps`` steps and record them on the device, without waiting for it.
 
         The same bits as as many step() calls, each after writing its wrench into :attr:`wrench` and its controls into :attr:`control`,
-        where the last ones stay. The step is captured once for all rollouts; arrays are new each time. Status and iterations of the
-        simulator are afterwards those of all steps, as after step(steps).
+        where the last ones stay. The step is captured once for all rollouts, once more for those that record bodies; arrays are new each
+        time. Status and iterations of the simulator are afterwards those of all steps, as after step(steps).
 
         Args:
             steps: number of steps, at least 1.
@@ -469,14 +469,16 @@ class Simulator:
         self._load([k.kinematics, k.dynamics])
         scene = [self.topology, self.parameters, self.trees]
         mass, bias = wp.zeros((self.num_envs, n, n), dtype=self.real, device=self.device), self._array(n, self.real)
-        self.launch(k.kinematics, [self.q, self.v, *scene, self.bodies])
+        self.launch(k.kinematics, [self.q, self.v, *scene, self.bodies, self._all])
         nothing = self._array(self.model.num_bodies, self._types.spatial)
         self.launch(k.dynamics, [*scene, nothing, self.v, self.bodies, mass, bias])
         return mass, bias
 
-    def _refresh_bodies(self) -> None:
+    def _refresh_bodies(self, some: wp.array | None = None) -> None:
+        """Poses and velocities of bodies, from q and v; of environments with joints some [E], those of which it is not zero."""
         if self.model.articulated:
-            self.launch(self._kernels.kinematics, [self.q, self.v, self.topology, self.parameters, self.mechanics, self.bodies])
+            state, some = [self.q, self.v, self.topology, self.parameters, self.mechanics, self.bodies], self._all if some is None else some
+            self.launch(self._kernels.kinematics, [*state, some])
         else:
             self.launch(self._kernels.kinematics, [self.q, self.v, self.topology, self.bodies], self.model.num_bodies)
 
@@ -498,7 +500,10 @@ class Simulator:
             )
 
     def _step_kernels(self) -> None:
-        """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back; there is one while kernels load."""
+        """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back; there is one while kernels load.
+
+        Bodies are where they were before it: q and v are ahead of them.
+        """
         k, h, b, scene = self._kernels, self.dt, self.model.num_bodies, [self.topology, self.parameters]
         halves = self.integrator == "midpoint" and not self._averages
         self._refresh_bodies()
@@ -543,14 +548,20 @@ class Simulator:
             self.launch(k.integrate_midpoint, [*scene, self.bodies, self.next_velocity, self.wrench, h, self.q, self.v], b)
         else:
             self.launch(k.integrate, [self.topology, self.bodies, self.next_velocity, h, self.q, self.v], b)
-        self._refresh_bodies()
         if self.project_loops:
+            self._refresh_bodies()
             loops = [*scene, self.mechanics, self.bodies, self.rows, *self._loop_system, self.q, self.v, h]
             for again in range(projection.ROUNDS + 1):
                 self.launch(k.project, [*loops, again, self._apart])
                 self._refresh_bodies()
-        if self.model.articulated and not halves and not self._idle(k.land, self.mechanics.landing):
+        if self.model.articulated and not halves and not self._idle(k.land, self.mechanics.lands):
+            self._refresh_bodies(self.mechanics.lands)
             self.launch(k.land, [self.parameters, self.mechanics, self.bodies, h, self.v])
+
+    def _last_step(self) -> None:
+        """One step, and bodies where it has brought them."""
+        self._step_kernels()
+        self._refresh_bodies()
 
     def _solve_kernels(self, todo: wp.array, number: wp.array, status: wp.array) -> None:
         """The environments todo[:number] by the first method, those left by the next, and so on; each answer certified."""
@@ -727,6 +738,7 @@ class Simulator:
         self.wrench = self._array(b, t.spatial)
         self.everyone: wp.array = wp.array(np.arange(e, dtype=np.int32), dtype=int, device=self.device)
         self.num_everyone: wp.array = wp.array([e], dtype=int, device=self.device)
+        self._all: wp.array = wp.empty(0, dtype=int, device=self.device)  # of kinematics, in place of a choice of environments
         self.status, self.iterations, self.unsolved, self.reason = (wp.zeros(e, dtype=int, device=self.device) for _ in range(4))
         self.residual, self.residual_energy, self.best_residual = (wp.zeros(e, dtype=self.real, device=self.device) for _ in range(3))
 
