@@ -64,14 +64,34 @@ def pair_functions(real) -> SimpleNamespace:
         """Are two shapes further apart along an axis of the world than ``reach`` allows for, by their bounds?"""
         return wp.abs(a[0] - b[0]) >= a[3] + b[3] or wp.abs(a[1] - b[1]) >= a[4] + b[4] or wp.abs(a[2] - b[2]) >= a[5] + b[5]
 
+    @wp.func
+    def fastest(topology: Topology, extent: wp.array(dtype=vec4), bodies: Bodies, env: int) -> real:
+        """Twice the speed that no point of a shape exceeds: faster no two approach each other."""
+        result = real(0.0)
+        for shape in range(topology.shape_body.shape[0]):
+            body = topology.shape_body[shape]
+            if body >= 0:
+                half = extent[shape]
+                centre = wp.transform_point(bodies.pose[env, body], wp.transform_get_translation(topology.shape_pose[shape]))
+                lever = sum_norm(vec3(half[0], half[1], half[2])) + half[3] + sum_norm(centre - bodies.com[env, body])
+                twist = bodies.velocity[env, body]
+                result = wp.max(result, sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
+        return real(2.0) * result
+
     @kernel()
     def bounds(topology: Topology, extent: wp.array(dtype=vec4), bodies: Bodies, h: real, lanes: int, stride: int):
         """Centre of every shape, and how far it extends along the axes of the world, with at least its ``reach``; of the world's once.
 
-        extent: Model.shape_extent.
+        extent: Model.shape_extent. Where no step has said how fast something hits something, the fastest that moves might.
         """
         start, lane = wp.tid()
         for env in range(start, bodies.bounds.shape[0], stride):
+            alert = real(0.0)
+            if bodies.alert.shape[0] > 0:
+                alert = bodies.alert[env]
+                if alert < real(0.0):
+                    alert = fastest(topology, extent, bodies, env)
+                    bodies.alert[env] = alert  # lanes that come later find what they would have written
             for shape in range(lane, bodies.bounds.shape[1], lanes):
                 body = topology.shape_body[shape]
                 if body < 0 and bodies.bounds[env, shape][3] > real(0.0):
@@ -85,8 +105,7 @@ def pair_functions(real) -> SimpleNamespace:
                     twist = bodies.free_velocity[env, body]
                     lever = radius + sum_norm(wp.transform_get_translation(pose) - bodies.com[env, body])
                     far += real(2.0) * h * (sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
-                    if bodies.alert.shape[0] > 0:
-                        far += real(2.0) * h * bodies.alert[env]
+                    far += real(2.0) * h * alert
                 centre = wp.transform_get_translation(pose)
                 R = wp.quat_to_matrix(wp.transform_get_rotation(pose))
                 x = wp.abs(R[0, 0]) * half[0] + wp.abs(R[0, 1]) * half[1] + wp.abs(R[0, 2]) * half[2]

@@ -428,16 +428,16 @@ def make(real) -> SimpleNamespace:
                 down = -(wp.transpose(turn) * normal)
                 above = wp.dot(normal, centre - origin)
                 slot = topology.pair_slots[pair]
-                kind = hulls.kind[shape]
+                sort = hulls.kind[shape]
                 number = topology.pair_slots[pair + 1] - slot
                 for k in range(number):
                     p = vec3()
-                    if turned(kind):
+                    if turned(sort):
                         z = -size[1]
                         if k >= RING:
                             z = size[1]
                         p = ring_point(size[0], z, down, k % RING, RING)
-                        if kind == CONE and k == RING:
+                        if sort == CONE and k == RING:
                             p = vec3(real(0.0), real(0.0), z)
                     else:
                         p = hulls.point[hulls.first_point[shape] + k]

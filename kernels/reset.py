@@ -40,7 +40,7 @@ def make(real):
         for b in range(wrench.shape[1]):
             wrench[env, b] = spatial()
         if bodies.alert.shape[0] > 0:
-            bodies.alert[env] = real(0.0)
+            bodies.alert[env] = real(-1.0)
         for slot in range(slots.last_feature.shape[1]):
             slots.last_feature[env, slot] = -1
         contacts.count[env] = 0

@@ -105,7 +105,7 @@ def scalar_types(real) -> SimpleNamespace:
         bounds: wp.array2d(dtype=spatial)  # [E, S | 0] centre of a shape, reach along each axis (collide.py); 0 without pairs
         # Where no two free bodies can touch neither is there.
         hit: wp.array2d(dtype=real)  # [E, B | 0] speed that the body may take on in the step from what hits it, m/s
-        alert: wp.array(dtype=real)  # [E | 0] fastest approach of what hits something in this step or the next, m/s
+        alert: wp.array(dtype=real)  # [E | 0] fastest approach of what hits something in this step or the next, m/s; below 0 not known
 
     @wp.struct
     class Slots:

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Batches: environments are independent to the last bit, failures stay where they are, parameters differ per environment."""
 
+import ast
 import re
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 import warp as wp
+import warp_lcp.kernels
 from conftest import DEVICE, block_on_plane, paper_box, random_quaternions, simulator
 from conftest import GRAVITY as G
 
@@ -92,6 +95,42 @@ def test_recorded_steps_equal_eager_steps():
     for _ in range(100):
         eager._step_kernels()
     assert (bits(recorded) == bits(eager)).all()
+
+
+@pytest.mark.parametrize("shape", ["sphere", "box", "capsule", "cylinder", "cone", "ellipsoid", "hull"])
+@pytest.mark.parametrize("ground", ["plane", "box", "mesh"])
+def test_environments_of_every_shape_on_every_ground_are_alike(shape, ground):
+    """Those of a batch end as one alone does: threads of the CPU walk over all of them."""
+    builder = wl.ModelBuilder()
+    if ground == "plane":
+        builder.add_plane()
+    elif ground == "box":
+        builder.add_box(-1, (5, 5, 0.5), pose=(0, 0, -0.5, 0, 0, 0, 1))
+    else:
+        builder.add_mesh(-1, [(-5, -5, 0), (5, -5, 0), (5, 5, 0), (-5, 5, 0)], [(0, 1, 2), (0, 2, 3)])
+    body = builder.add_body(pose=(0, 0, 0.21 if shape == "capsule" else 0.11, 0, 0, 0, 1), velocity=(0.5, 0.2, 0))
+    if shape == "hull":
+        builder.add_hull(body, [(x, y, z) for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0.1, 0.1)])
+    else:
+        sizes = {"sphere": (0.1,), "box": ((0.1, 0.1, 0.1),), "ellipsoid": ((0.1, 0.12, 0.1),)}
+        getattr(builder, f"add_{shape}")(body, *sizes.get(shape, (0.1, 0.1)))
+    alone, batch = simulator(builder, dt=2e-3), simulator(builder, 4, dt=2e-3)
+    for sim in (alone, batch):
+        sim.step(100)
+    assert (bits(batch) == bits(alone)).all()
+    assert 0.05 < alone.q.numpy()[0, 2] < 0.21
+
+
+def test_no_kernel_assigns_to_its_parameters():
+    """On the CPU the next environment of the same thread would find them changed."""
+    kernels = 0
+    for file in Path(warp_lcp.kernels.__path__[0]).glob("*.py"):
+        for function in ast.walk(ast.parse(file.read_text())):
+            if isinstance(function, ast.FunctionDef) and any(ast.unparse(d).startswith("kernel(") for d in function.decorator_list):
+                stored = {n.id for n in ast.walk(function) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+                assert not stored & {argument.arg for argument in function.args.args}, (file.name, function.name)
+                kernels += 1
+    assert kernels > 50
 
 
 @pytest.mark.parametrize("integrator", ["euler", "midpoint"])

@@ -364,6 +364,32 @@ def test_a_hit_is_handed_on_along_a_row_with_gaps(n, mass, kind, gap, h):
         assert np.linalg.norm(np.diff(x, axis=0), axis=1).min() > 2 * r - 5e-5
 
 
+@pytest.mark.parametrize("again", [False, True], ids=["from the start", "after a reset"])
+@pytest.mark.parametrize("gap", [5e-3, 1.2e-2, 2e-2, 3e-2])
+@pytest.mark.parametrize("kind", ["sphere", "capsule", "box"])
+def test_a_hit_in_the_first_step_is_handed_on(kind, gap, again):
+    """No step before has seen it come: the first is 1 mm from the second, and makes 50 mm a step. 0.05 mm as above."""
+    r = 0.05
+    builder = wl.ModelBuilder()
+    builder.add_plane()
+    for x, speed in ((-2 * r - 1e-3, 5.0), (0.0, 0.0), (2 * r + gap, 0.0)):
+        body = builder.add_body(pose=(x, 0, r, 0, 0, 0, 1), velocity=(speed, 0, 0), mass=1.0)
+        if kind == "sphere":
+            builder.add_sphere(body, r)
+        elif kind == "box":
+            builder.add_box(body, (r, r, r))
+        else:
+            builder.add_capsule(body, r, 0.1, pose=(0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)))
+    sim = simulator(builder, dt=1e-2)
+    if again:
+        sim.step(5)
+        sim.reset()
+    for _ in range(5):
+        sim.step()
+        assert sim.status.numpy()[0] == 0
+        assert np.diff(sim.q.numpy().reshape(3, 7)[:, 0]).min() > 2 * r - 5e-5
+
+
 def test_what_does_not_move_hands_no_hit_on():
     """A floor that is a fixed body opens as many contacts as one of the world where a ball of twelve hits it: one."""
     rows = []

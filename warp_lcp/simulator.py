@@ -218,10 +218,14 @@ class Simulator:
             left -= 1
             (self._step_kernels if left else self._last_step)()
             self._loading.forget_loaded()
+        if left > 1 or not count:
+            graph = self._captured("step", self._step_kernels)
+            for _ in range(left - 1):
+                wp.capture_launch(graph)
         if left or not count:
-            on, last = self._captured("step", self._step_kernels), self._captured("last step", self._last_step)
-            for i in range(left):
-                wp.capture_launch(on if i + 1 < left else last)
+            graph = self._captured("last step", self._last_step)
+            if left:
+                wp.capture_launch(graph)
         self._finish(count)
 
     def rollout(
@@ -502,7 +506,7 @@ class Simulator:
     def _step_kernels(self) -> None:
         """One step: kinematics, contacts, rows, solve, certify, integrate. Records no host read-back; there is one while kernels load.
 
-        Bodies are where they were before it: q and v are ahead of them.
+        Behind it bodies are not where q and v are: _refresh_bodies.
         """
         k, h, b, scene = self._kernels, self.dt, self.model.num_bodies, [self.topology, self.parameters]
         halves = self.integrator == "midpoint" and not self._averages
@@ -555,7 +559,8 @@ class Simulator:
                 self.launch(k.project, [*loops, again, self._apart])
                 self._refresh_bodies()
         if self.model.articulated and not halves and not self._idle(k.land, self.mechanics.lands):
-            self._refresh_bodies(self.mechanics.lands)
+            if not self.project_loops:
+                self._refresh_bodies(self.mechanics.lands)
             self.launch(k.land, [self.parameters, self.mechanics, self.bodies, h, self.v])
 
     def _last_step(self) -> None:
@@ -694,7 +699,7 @@ class Simulator:
         bundle.bounds = self._array(len(m.shape_body) if m.bounded else 0, t.spatial)
         self._extent = self._constant(m.shape_extent, t.vec4)
         bundle.hit = self._array(b if m.bodies_meet else 0, self.real)
-        bundle.alert = wp.zeros(e if m.bodies_meet else 0, dtype=self.real, device=self.device)
+        bundle.alert = wp.full(e if m.bodies_meet else 0, -1.0, dtype=self.real, device=self.device)
         self.next_velocity = self._array(b, t.spatial)
         #: What solvers know of the bodies: the bodies themselves, or the trees they hang in.
         self.mechanics: Any = bundle
