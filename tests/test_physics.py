@@ -335,6 +335,16 @@ def test_a_soft_sphere_rolls_over_seams(h, loss, hop):
     assert 1 - sim.v.numpy()[0, 0] / 2.1 < loss
 
 
+def as_wide(builder: wl.ModelBuilder, body: int, kind: str, r: float) -> None:
+    """A shape that reaches from -r to r along x; a capsule lies across."""
+    if kind == "sphere":
+        builder.add_sphere(body, r)
+    elif kind == "box":
+        builder.add_box(body, (r, r, r))
+    else:
+        builder.add_capsule(body, r, 0.1, pose=(0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)))
+
+
 @pytest.mark.parametrize("h", [1e-3, 5e-3, 1e-2])
 @pytest.mark.parametrize("gap", [1e-4, 1e-3, 5e-3, 2e-2])
 @pytest.mark.parametrize("kind", ["sphere", "capsule", "box"])
@@ -350,12 +360,7 @@ def test_a_hit_is_handed_on_along_a_row_with_gaps(n, mass, kind, gap, h):
     for i in range(n) if n > 0 else reversed(range(-n)):
         at = (2 * r + gap) * i - (0.3 if i == 0 else 0.0)
         body = builder.add_body(pose=(at, 0, r, 0, 0, 0, 1), velocity=(5.0 if i == 0 else 0.0, 0, 0), mass=mass if i == 0 else 1.0)
-        if kind == "sphere":
-            builder.add_sphere(body, r)
-        elif kind == "box":
-            builder.add_box(body, (r, r, r))
-        else:
-            builder.add_capsule(body, r, 0.1, pose=(0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)))
+        as_wide(builder, body, kind, r)
     sim = simulator(builder, dt=h)
     for _ in range(round(0.2 / h)):
         sim.step()
@@ -374,12 +379,7 @@ def test_a_hit_in_the_first_step_is_handed_on(kind, gap, again):
     builder.add_plane()
     for x, speed in ((-2 * r - 1e-3, 5.0), (0.0, 0.0), (2 * r + gap, 0.0)):
         body = builder.add_body(pose=(x, 0, r, 0, 0, 0, 1), velocity=(speed, 0, 0), mass=1.0)
-        if kind == "sphere":
-            builder.add_sphere(body, r)
-        elif kind == "box":
-            builder.add_box(body, (r, r, r))
-        else:
-            builder.add_capsule(body, r, 0.1, pose=(0, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)))
+        as_wide(builder, body, kind, r)
     sim = simulator(builder, dt=1e-2)
     if again:
         sim.step(5)
