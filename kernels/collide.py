@@ -65,6 +65,12 @@ def pair_functions(real) -> SimpleNamespace:
         return wp.abs(a[0] - b[0]) >= a[3] + b[3] or wp.abs(a[1] - b[1]) >= a[4] + b[4] or wp.abs(a[2] - b[2]) >= a[5] + b[5]
 
     @wp.func
+    def greatest_speed(bodies: Bodies, twist: spatial, env: int, body: int, centre: vec3, radius: real) -> real:
+        """At least that of any point within `radius` of `centre`, without a root."""
+        lever = radius + sum_norm(centre - bodies.com[env, body])
+        return sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever
+
+    @wp.func
     def fastest(topology: Topology, extent: wp.array(dtype=vec4), bodies: Bodies, env: int) -> real:
         """Twice the speed that no point of a shape exceeds: faster no two approach each other."""
         result = real(0.0)
@@ -73,9 +79,8 @@ def pair_functions(real) -> SimpleNamespace:
             if body >= 0:
                 half = extent[shape]
                 centre = wp.transform_point(bodies.pose[env, body], wp.transform_get_translation(topology.shape_pose[shape]))
-                lever = sum_norm(vec3(half[0], half[1], half[2])) + half[3] + sum_norm(centre - bodies.com[env, body])
-                twist = bodies.velocity[env, body]
-                result = wp.max(result, sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
+                radius = sum_norm(vec3(half[0], half[1], half[2])) + half[3]
+                result = wp.max(result, greatest_speed(bodies, bodies.velocity[env, body], env, body, centre, radius))
         return real(2.0) * result
 
     @kernel()
@@ -102,10 +107,9 @@ def pair_functions(real) -> SimpleNamespace:
                 far = real(0.02) * radius + half[3] + real(2.0) * h * sum_norm(topology.surface_velocity[shape])
                 if body >= 0:
                     pose = wp.transform_multiply(bodies.pose[env, body], pose)
-                    twist = bodies.free_velocity[env, body]
-                    lever = radius + sum_norm(wp.transform_get_translation(pose) - bodies.com[env, body])
-                    far += real(2.0) * h * (sum_norm(wp.spatial_top(twist)) + sum_norm(wp.spatial_bottom(twist)) * lever)
-                    far += real(2.0) * h * alert
+                    centre = wp.transform_get_translation(pose)
+                    speed = greatest_speed(bodies, bodies.free_velocity[env, body], env, body, centre, radius)
+                    far += real(2.0) * h * (speed + alert)
                 centre = wp.transform_get_translation(pose)
                 R = wp.quat_to_matrix(wp.transform_get_rotation(pose))
                 x = wp.abs(R[0, 0]) * half[0] + wp.abs(R[0, 1]) * half[1] + wp.abs(R[0, 2]) * half[2]
