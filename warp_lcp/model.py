@@ -471,7 +471,7 @@ class Model:
         """[K + 1] offsets: pairs kind_pairs[k] ... kind_pairs[k + 1] - 1 are of the same two shape types; kinds with planes come first."""
         types = self.shape_type[self.pairs]
         starts = np.flatnonzero((types[1:] != types[:-1]).any(axis=1)) + 1
-        return np.unique([0, *starts, len(types)]).astype(np.int32)
+        return np.array(sorted({0, *starts.tolist(), len(types)}), dtype=np.int32)
 
     @property
     def num_slots(self) -> int:
