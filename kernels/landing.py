@@ -32,6 +32,8 @@ HIT = wp.constant(2.0)
 BENT = wp.constant(0.2)
 # What was hit lands where momenta are off by this part of their square, by a hundredth: less than that is not worth the factors of a pose.
 MISSED = wp.constant(1.0e-4)
+# What turns no body by half of a hundredth [rad] in a step is off by less, and need not be looked at.
+STILL = wp.constant(5.0e-3)
 # What turns by too much lands where the new pose would make this part of the energy. (With a hundredth, and BENT half as much, a four-bar
 # at 20 ms, 0.28 rad a step, was braked and never came over the top.)
 MADE = wp.constant(0.05)
@@ -126,13 +128,17 @@ def make(real) -> SimpleNamespace:
                     trees.left[env, i] = after
                 trees.largest[env, root] = largest
             weigh(parameters, trees, next_velocity, trees.bent, env)
+            turned = real(0.0)  # the square of what a body turns by
+            for b in range(trees.order.shape[0]):
+                turned = wp.max(turned, h * h * wp.length_sq(wp.spatial_bottom(next_velocity[env, b])))
+            turns = turned > real(STILL) * real(STILL)
             landing = bool(False)
             for k in range(trees.order.shape[0]):
                 b = trees.order[k]
                 root = trees.root[b]
                 if b == root:
                     largest = trees.largest[env, b]
-                    if was_hit(largest) or trees.landing[env, b] == HARD:
+                    if (turns and was_hit(largest)) or trees.landing[env, b] == HARD:
                         trees.landing[env, b] = HARD
                     elif trees.worth[env, b][1] > real(BENT) * trees.worth[env, b][0]:
                         trees.landing[env, b] = FAST
