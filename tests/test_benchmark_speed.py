@@ -117,14 +117,18 @@ def test_start_up(monkeypatch):
     monkeypatch.setattr(start_up, "COLD", 1)
     monkeypatch.setattr(start_up, "WARM", 1)
     row = start_up.one("box", "box_on_ground")
-    assert row["modules"] > 0
-    assert 0.0 < row["read_s"] < row["warm_s"] < row["cold_s"] <= row["cold_all_s"]
-    nothing = {"scene": "nothing", "engine": start_up.WARP, **start_up.timed(start_up.NOTHING)[0]}
+    assert row["cold_modules"] == row["warm_modules"] > 0
+    for state in ("cold", "warm"):
+        read, after, whole = row[f"{state}_read_s"], row[f"{state}_after_import_s"], row[f"{state}_s"]
+        assert 0.0 < row[f"{state}_import_s"] < whole - after
+        assert 0.0 < read < after < whole <= row[f"{state}_all_s"]
+    assert row["warm_after_import_s"] < row["cold_after_import_s"]
+    nothing = {"scene": "nothing", "engine": start_up.WARP, **start_up.timed(start_up.NOTHING)}
     assert 0.0 < nothing["warm_s"] < nothing["cold_s"] < row["cold_all_s"]  # it compiles one module, a box eleven
     slower = {"scene": "box", "engine": "other", "cold_s": 2.0 * row["cold_s"], "warm_s": 1.0}
     none = {"scene": "box", "engine": "none", "refused": "none: no boxes"}
     _, _, least, ours, other, *refused = start_up.markdown([nothing, row, slower, none]).splitlines()
-    assert least.endswith("| - | - | - | 1 |")
+    assert least.endswith("| - | - | - | - | 1 |")
     assert ours.startswith(f"| box | {row['engine']} | {row['cold_s']:.1f} | {row['warm_s']:.2f} |")
-    assert other.endswith(f"| - | - | 2 | {2.0 * row['cold_s'] / nothing['cold_s']:.2g} |")
+    assert other.endswith(f"| - | - | - | 2 | {2.0 * row['cold_s'] / nothing['cold_s']:.2g} |")
     assert "box: refused by none: no boxes" in refused
