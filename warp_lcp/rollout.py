@@ -16,9 +16,9 @@ from .kernels import record as recording
 if TYPE_CHECKING:
     from .simulator import Simulator
 
-#: What a rollout can record.
 #: What may drive the joints in each step, names of Control's fields.
 CONTROLS = ("position", "velocity", "force")
+#: What a rollout can record.
 FIELDS = ("q", "v", "body_pose", "body_velocity", "status", "iterations", "residual", "residual_energy")
 
 
