@@ -32,8 +32,6 @@ HIT = wp.constant(2.0)
 BENT = wp.constant(0.2)
 # What was hit lands where momenta are off by this part of their square, by a hundredth: less than that is not worth the factors of a pose.
 MISSED = wp.constant(1.0e-4)
-# What turns no body by half of a hundredth [rad] in a step is off by less, and need not be looked at.
-STILL = wp.constant(5.0e-3)
 # What turns by too much lands where the new pose would make this part of the energy. (With a hundredth, and BENT half as much, a four-bar
 # at 20 ms, 0.28 rad a step, was braked and never came over the top.)
 MADE = wp.constant(0.05)
@@ -128,10 +126,18 @@ def make(real) -> SimpleNamespace:
                     trees.left[env, i] = after
                 trees.largest[env, root] = largest
             weigh(parameters, trees, next_velocity, trees.bent, env)
-            turned = real(0.0)  # the square of what a body turns by
+            # Where nothing turns by more than h w, momenta are off by at most (h w)^2 of their square, times the mass of all over the least
+            # (light links turn, what is heavy rests at their end). Where that is too little, nobody needs the new pose to say so.
+            turned = real(0.0)
+            all_mass = real(0.0)
+            least_mass = real(1.0e30)
             for b in range(trees.order.shape[0]):
                 turned = wp.max(turned, h * h * wp.length_sq(wp.spatial_bottom(next_velocity[env, b])))
-            turns = turned > real(STILL) * real(STILL)
+                m = parameters.mass[env % parameters.mass.shape[0], b]
+                if m > real(0.0):
+                    all_mass += m
+                    least_mass = wp.min(least_mass, m)
+            turns = turned * all_mass > real(MISSED) * least_mass
             landing = bool(False)
             for k in range(trees.order.shape[0]):
                 b = trees.order[k]
