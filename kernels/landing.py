@@ -39,7 +39,7 @@ MADE = wp.constant(0.05)
 
 @factory
 def make(real) -> SimpleNamespace:
-    """Kernels ``integrate``, ``land`` after kinematics at q+, and ``drift``; launch with dim (E), ``drift`` with dim (E, B)."""
+    """Kernels ``integrate``, then after kinematics at q+ ``judge_landing`` and ``land``; ``drift``. Launch with dim (E), drift (E, B)."""
     t = scalar_types(real)
     vec2, vec3, spatial = t.vec2, t.vec3, t.spatial
     Bodies, Parameters, Topology = t.Bodies, t.Parameters, t.Topology
@@ -175,12 +175,11 @@ def make(real) -> SimpleNamespace:
                 advance(topology, trees, bodies, v, part * h, q, env, b)
 
     @kernel()
-    def land(parameters: Parameters, trees: Trees, bodies: Bodies, h: real, v: wp.array2d(dtype=real), stride: int):
-        """v at q+ of what was hit, after kinematics there; those of bodies are for the next kinematics."""
+    def judge_landing(parameters: Parameters, trees: Trees, bodies: Bodies, stride: int):
+        """After kinematics at q+: which trees land there, and by what push of their bodies."""
         start, _ = wp.tid()
-        for env in range(start, v.shape[0], stride):
-            landing = trees.lands[env] != 0
-            if landing:
+        for env in range(start, trees.lands.shape[0], stride):
+            if trees.lands[env] != 0:
                 inertias(parameters, trees, bodies, env)
                 for b in range(trees.order.shape[0]):
                     trees.momentum[env, b] -= momentum(parameters, trees, bodies.velocity[env, b], env, b)
@@ -204,7 +203,14 @@ def make(real) -> SimpleNamespace:
                         trees.change[env, i] = real(0.0)
                         if lands:
                             trees.change[env, i] = trees.given[env, i]
-            if landing:
+                trees.lands[env] = int(landing)
+
+    @kernel()
+    def land(parameters: Parameters, trees: Trees, bodies: Bodies, h: real, v: wp.array2d(dtype=real), stride: int):
+        """v at q+ of what was hit; those of bodies are for the next kinematics."""
+        start, _ = wp.tid()
+        for env in range(start, v.shape[0], stride):
+            if trees.lands[env] != 0:
                 factorise(parameters, trees, bodies, h, False, env)
                 propagate(trees, trees.push, trees.gained, env)
                 for i in range(trees.before.shape[0]):
@@ -228,4 +234,4 @@ def make(real) -> SimpleNamespace:
         for env in range(start, q.shape[0], stride):
             advance(topology, trees, bodies, v, h, q, env, b)
 
-    return SimpleNamespace(integrate=integrate, land=land, drift=drift)
+    return SimpleNamespace(integrate=integrate, judge_landing=judge_landing, land=land, drift=drift)

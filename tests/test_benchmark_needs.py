@@ -53,7 +53,7 @@ def test_shipped_scenes_compile_kernels_of_what_is_in_them(name):
     bounces = {"bounce", "judge", "settle"} if scene.bounces else set()
     single = scene.dofs == 6
     rows = {"contact_rows"} if bounces or not single else set()
-    joints = {"reset_control", "land"} if scene.articulated else {"pgs"}
+    joints = {"reset_control", "judge_landing", "land"} if scene.articulated else {"pgs"}
     joints |= {"joint_rows"} if ledger(scene)["joint_rows"] else set()
     joints |= {"calm_overlaps"} if scene.articulated and scene.bodies_meet else set()
     assert set(ledger(scene)["kernels"]) == stages | pairs | bounds | bounces | rows | joints | {"solve_single" if single else "pivot"}

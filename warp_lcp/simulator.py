@@ -558,10 +558,12 @@ class Simulator:
             for again in range(projection.ROUNDS + 1):
                 self.launch(k.project, [*loops, again, self._apart])
                 self._refresh_bodies()
-        if self.model.articulated and not halves and not self._idle(k.land, self.mechanics.lands):
+        if self.model.articulated and not halves and not self._idle(k.judge_landing, self.mechanics.lands):
             if not self.project_loops:
                 self._refresh_bodies(self.mechanics.lands)
-            self.launch(k.land, [self.parameters, self.mechanics, self.bodies, h, self.v])
+            self.launch(k.judge_landing, [self.parameters, self.mechanics, self.bodies])
+            if not self._idle(k.land, self.mechanics.lands):
+                self.launch(k.land, [self.parameters, self.mechanics, self.bodies, h, self.v])
 
     def _last_step(self) -> None:
         """One step, and bodies where it has brought them."""

@@ -65,7 +65,7 @@ def stage_kernels(model: Model, real: Any, integrator: str, without_rows: bool) 
         if model.articulated and model.bodies_meet:
             stages.calm_overlaps = rows.calm_overlaps
     if integrator != "midpoint" and model.articulated:
-        stages.land = ends.land
+        stages.judge_landing, stages.land = ends.judge_landing, ends.land
     stages.reset = reset.make(real)
     if model.articulated:
         stages.reset_control = body.reset_control
