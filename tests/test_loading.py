@@ -81,24 +81,31 @@ def state(sim):
     return sim.q.numpy(), sim.v.numpy(), sim.residual.numpy(), sim.iterations.numpy()
 
 
-def links(bend):
+def links(bend, speed):
     """Two bars on a ball joint that fall, flat or with one end ahead [rad]."""
     builder = wl.ModelBuilder()
     builder.add_plane()
     for angle, x, z in ((0.0, 0.0, 0.2), (bend, 0.2 + 0.2 * math.cos(bend), 0.2 - 0.2 * math.sin(bend))):
         turn = 0.5 * (0.5 * math.pi + angle)
         pose = (x, 0, z, 0, math.sin(turn), 0, math.cos(turn))
-        builder.add_capsule(builder.add_body(pose=pose, velocity=(0, 0, -8)), 0.05, 0.15)
+        builder.add_capsule(builder.add_body(pose=pose, velocity=(0, 0, -speed)), 0.05, 0.15)
     ahead, behind = ((0, 0, z, 0, 0, 0, 1) for z in (0.2, -0.2))
     builder.add_joint(wl.JointType.SPHERICAL, 0, 1, parent_frame=ahead, child_frame=behind)
     return builder.finalize()
 
 
-@pytest.mark.parametrize("held", [("sphere_sphere", "pgs"), ("judge_landing", "land")])
-def test_first_steps_wait_for_no_kernel_that_they_do_not_need(monkeypatch, own_queue, held):
-    """Balls too far apart to meet, and a contact that velocity pivoting solves; links that nothing turns: the same bits as with every
-    kernel there."""
-    model = links(0.0) if "land" in held else balls(0.11, 1.0)
+@pytest.mark.parametrize(
+    ("model", "held"),
+    [
+        (balls(0.11, 1.0), ("sphere_sphere", "pgs")),
+        (links(0.0, 8.0), ("judge_landing", "land")),
+        (links(0.3, 2.0), ("land",)),
+    ],
+    ids=["far apart", "not turned", "turned by too little"],
+)
+def test_first_steps_wait_for_no_kernel_that_they_do_not_need(monkeypatch, own_queue, model, held):
+    """Balls too far apart to meet, and a contact that velocity pivoting solves; links that a hit does not turn, or turns by too little to
+    land: the same bits as with every kernel there."""
     expected = moved(model, 100)
     held += ("proximal_contacts", "reset")
     gate = Gate(monkeypatch, own_queue, *held)
@@ -116,7 +123,7 @@ def test_first_steps_wait_for_no_kernel_that_they_do_not_need(monkeypatch, own_q
 @pytest.mark.parametrize("held", ["sphere_sphere", "pivot", "certify", "contact_rows", "judge_landing", "land"])
 def test_a_step_waits_for_a_kernel_that_it_needs(monkeypatch, own_queue, held):
     """Among others for that of pairs once they come near; the answer is the one of a start without waiting."""
-    model = links(0.3) if "land" in held else balls(0.11, 0.35)
+    model = links(0.3, 8.0) if "land" in held else balls(0.11, 0.35)
     expected = moved(model, 200)
     gate = Gate(monkeypatch, own_queue, held)
     sim = wl.Simulator(model, 2, device="cpu")
