@@ -153,36 +153,6 @@ def tops(model: Model, bodies: tuple[int, int]) -> tuple[int, int]:
     return first[0], first[1]
 
 
-def possible(model: Model, name: str, value: np.ndarray) -> np.ndarray:
-    """[..., nv] or [..., nv, 3] which numbers a joint's parameter may have: what is a row of its own, and what a part of M, is settled."""
-    allowed: np.ndarray = np.array((np.isfinite(value) | (name == "gains")) & (value >= 0.0))
-    if name == "joint_friction":
-        has_row = np.isin(np.arange(model.nv), [row.velocity for row in rows(model) if row.kind == int(tree.LIMIT_LOW)])
-        allowed = allowed & (has_row | (value == 0.0))
-    elif name == "gains":
-        driven, bounded = (model.gains[:, :2] > 0.0).sum(axis=1) > 0, np.isfinite(model.gains[:, 2])
-        stiff = np.isfinite(value[..., :2]) & (driven[:, None] | (value[..., :2] == 0.0))
-        allowed = allowed & np.concatenate([stiff, (np.isfinite(value[..., 2]) == bounded)[..., None]], axis=-1)
-    return allowed
-
-
-def parameter(model: Model, name: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Fields of ``Trees`` that hold a joint's parameter [N, nv] or [N, nv, 3], with what they become."""
-    if name in ("armature", "damping"):
-        return [(name, value)]
-    low = [(k, row.velocity) for k, row in enumerate(rows(model)) if row.kind == int(tree.LIMIT_LOW)]
-    of_row, velocity = (np.array(x, dtype=int) for x in zip(*low, strict=True)) if low else (np.zeros(0, dtype=int), np.zeros(0, dtype=int))
-    if name == "joint_friction":
-        friction = np.zeros((len(value), len(rows(model))))
-        friction[:, of_row] = value[:, velocity]
-        return [("row_friction", friction)]
-    unbounded = np.isinf(model.gains[:, 2])
-    bounded = np.zeros((len(value), len(rows(model)), 3))
-    bounded[:, of_row] = np.where(unbounded[velocity][:, None], 0.0, value[:, velocity])
-    held = [("stiffness", np.where(unbounded, value[..., 0], 0.0)), ("rate", np.where(unbounded, value[..., 1], 0.0))]
-    return [*held, ("row_drive", bounded)]
-
-
 def coordinates(model: Model) -> np.ndarray:
     """[nv] coordinate in q of each velocity that has one of its own, -1."""
     result = np.full(model.nv, -1, dtype=np.int32)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from . import articulation, hulls, joints
+from . import articulation, hulls, joints, parameters
 from .arrays import check_finite, read
 from .errors import SimulationError, WarpLcpError, positive_number, whole_number
 from .kernels import (
@@ -31,22 +31,6 @@ from .rollout import CONTROLS, Recorder, Rollout
 from .stages import PRECISIONS, stage_kernels
 
 INTEGRATORS = ("euler", "midpoint")
-#: Parameters that may differ between environments, and what their numbers must be.
-PARAMETERS = {
-    "mass": "it must be finite and greater than zero",
-    "inertia": "it must be symmetric and positive definite, and no moment may exceed the sum of the others",
-    "com": "it must be finite",
-    "friction": "it must be finite and not negative, and mu_k no larger than mu_s",
-    "contact": "it must be finite and not negative (damping and slip threshold greater than zero), or NaN for Table 1",
-    "restitution": "it must be at least 0 and at most 1",
-    "gravity": "it must be finite",
-    "armature": "it must be finite and not negative",
-    "damping": "it must be finite and not negative",
-    "joint_friction": "it must be finite and not negative, and zero where the model has neither dry friction, a lower limit nor a drive",
-    "gains": "they must be finite and not negative, the greatest force infinite just where the model's is, and zero without a drive",
-}
-#: Those of joints: a model without has none.
-JOINT_PARAMETERS = ("armature", "damping", "joint_friction", "gains")
 #: Largest residual [m/s] of an answer that counts as solved.
 TOLERANCE = 1e-6
 
@@ -306,15 +290,15 @@ class Simulator:
         Raises:
             WarpLcpError: for an unknown name, a wrong shape, or a number that no body or contact can have.
         """
-        checked = {name: self._checked_parameter(name, value) for name, value in values.items()}
+        checked = {name: parameters.checked(self.model, self.num_envs, name, value) for name, value in values.items()}
         if "mass" in checked and "inertia" not in checked:
             inertia, mass = self.parameters.inertia.numpy(), self.parameters.mass.numpy()
             checked["inertia"] = inertia * (checked["mass"] / np.where(mass > 0.0, mass, 1.0))[..., None, None]
         if "restitution" in checked:
             self._set_restitution(checked.pop("restitution"))
         for name, value in checked.items():
-            if name in JOINT_PARAMETERS:
-                for field, numbers in articulation.parameter(self.model, name, value):
+            if name in parameters.OF_JOINTS:
+                for field, numbers in parameters.of_joints(self.model, name, value):
                     self._set_constant(self.mechanics, field, numbers)
             else:
                 self._set_constant(self.parameters, name, value)
@@ -354,13 +338,8 @@ class Simulator:
             if present is None or present.shape != (rows[name], pairs):
                 setattr(p, name, wp.empty((rows[name], pairs), dtype=dtype, device=self.device))
                 self._graphs.clear()
-        inputs = [self.topology, p, self._combine(0)]
+        inputs = [self.topology, p, self.ints(parameters.combine(self.model, 0))]
         self._launch(self._kernels.combine_pairs, (max(rows.values()), pairs), inputs)
-
-    def _combine(self, which: int) -> wp.array:
-        """[P] how the friction (0) or restitution (1) of a pair's two materials becomes one; none where all take the mean."""
-        modes = self.model.combine[self.model.pairs, which].max(axis=1, initial=0)
-        return self.ints(modes if modes.any() else [])
 
     def _set_constant(self, bundle: Any, name: str, value: np.ndarray) -> None:
         present = getattr(bundle, name)
@@ -378,7 +357,7 @@ class Simulator:
             k = restitution.make(self.real)
             self._kernels.bounce, self._kernels.judge, self._kernels.settle = k.bounce, k.judge, k.settle
             bounces = self.bounces = k.Bounces()
-            bounces.coefficient, bounces.combine = self._constant(value, self.real), self._combine(1)
+            bounces.coefficient, bounces.combine = self._constant(value, self.real), self.ints(parameters.combine(self.model, 1))
             bounces.kick, bounces.before = (
                 self._array(self.model.max_contacts, self.real),
                 self._array(self.model.max_contacts, self._types.vec3),
@@ -392,43 +371,6 @@ class Simulator:
             self._kernels.contact_rows = contacts.make(self.real, self.model.articulated).contact_rows
             self._load([k.bounce, k.judge, k.settle, self._kernels.contact_rows, self._methods[0].kernel])
             self._graphs.clear()
-
-    def _checked_parameter(self, name: str, value: Any) -> np.ndarray:
-        if name not in PARAMETERS:
-            raise WarpLcpError(f"set_parameters: {name!r} is not a parameter; choose from {', '.join(PARAMETERS)}")
-        if name in JOINT_PARAMETERS and not self.model.articulated:
-            raise WarpLcpError(f"set_parameters: {name!r} is of joints, and the model has none")
-        array = np.asarray(value.numpy() if isinstance(value, wp.array) else value, dtype=float)
-        shape = getattr(self.model, name).shape
-        if array.shape == shape:
-            array = array[None]
-        if array.shape not in ((1, *shape), (self.num_envs, *shape)):
-            raise WarpLcpError(f"set_parameters: {name} has shape {array.shape}; give {shape} or {(self.num_envs, *shape)}")
-        allowed: np.ndarray = np.isfinite(array) | (np.isnan(array) & (name == "contact"))
-        if name == "mass":
-            allowed &= (array > 0.0) | ((array == 0.0) & (self.model.mass == 0.0))  # of what is welded to others
-        elif name in JOINT_PARAMETERS:
-            allowed = articulation.possible(self.model, name, array)
-        elif name == "restitution":
-            allowed &= (array >= 0.0) & (array <= 1.0)
-        elif name == "friction":
-            allowed &= array >= 0.0
-            allowed[..., 1] &= array[..., 1] <= array[..., 0]
-        elif name == "contact":
-            allowed &= ~(array < 0.0)
-            allowed[..., [1, 3, 4]] &= array[..., [1, 3, 4]] != 0.0
-        elif name == "inertia" and allowed.all():
-            moments = np.linalg.eigvalsh(array)
-            possible = ((moments[..., 0] > 0.0) | (self.model.mass == 0.0)) & (
-                moments[..., 2] <= (moments[..., 0] + moments[..., 1]) * (1 + 1e-6)
-            )
-            possible &= np.isclose(array, np.swapaxes(array, -1, -2), rtol=1e-6, atol=0.0).all(axis=(-1, -2))
-            allowed &= (possible | (self.model.mass == 0.0))[..., None, None]
-        if not allowed.all():
-            where = tuple(int(i) for i in np.argwhere(~allowed)[0])
-            of = f" ({self.model.dof_names[where[1]]})" if name in JOINT_PARAMETERS else ""
-            raise WarpLcpError(f"set_parameters: {name}{list(where)}{of} is {array[where]}; {PARAMETERS[name]}")
-        return array
 
     @property
     def body_pose(self) -> wp.array:
