@@ -6,5 +6,9 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 device=${1:-cuda:0} out=${2:-benchmarks/results}
 nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv
-WARP_LCP_DEVICE=$device python3 -m pytest -q tests/test_paper_box.py tests/test_physics.py tests/test_batch.py tests/test_lcp.py tests/test_collide.py
+export WARP_LCP_DEVICE=$device
+python3 -m pytest -q tests/test_{paper_box,physics,batch,lcp,collide,restitution,rollout}.py
+python3 -m pytest -q tests/test_{joints,joint_parameters,joint_scenes,loops}.py
+python3 -m pytest -q -m slow tests/test_joint_scenes.py # 4096 quadrupeds
 python3 -m benchmarks speed --device "$device" --out "$out"
+python3 -m benchmarks robust --device "$device" --out "$out" # every shipped scene, robots among them

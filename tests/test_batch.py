@@ -173,11 +173,20 @@ def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
         sim.v.assign(np.random.default_rng(4).normal(size=sim.v.shape))
         return sim
 
-    cases = [partial(randomised, 40, **options) for options in ({}, {"method": "lemke"}, {"integrator": "midpoint"})] + [pass_each_other]
+    def kicked(name, **options):
+        """A scene with joints, each of which starts at a velocity of its own."""
+        sim = simulator(wl.load_usd(name), 20, 5e-3, **options)
+        sim.v.assign(np.random.default_rng(4).normal(size=sim.v.shape))
+        return sim
+
+    jointed = [("quadruped", {}), ("quadruped", {"method": "proximal_newton"}), ("humanoid", {"integrator": "midpoint"})]
+    cases = [(partial(kicked, name, **options), 60) for name, options in (*jointed, ("fourbar", {"project_loops": True}))]
+    cases += [(partial(randomised, 40, **options), 200) for options in ({}, {"method": "lemke"}, {"integrator": "midpoint"})]
+    cases += [(pass_each_other, 200)]
     expected = []
-    for case in cases:
+    for case, steps in cases:
         sim = case()
-        sim.step(200)
+        sim.step(steps)
         expected.append(bits(sim))
     listed = np.diff(sim.listed.numpy()[:, :3])  # on the plane, on each other
     assert (listed[:, 0] == 5).all()
@@ -194,10 +203,10 @@ def test_memory_layout_and_threads_of_a_gpu_give_the_same_bits(monkeypatch):
     monkeypatch.setattr(wl.Simulator, "launch", launch)
     monkeypatch.setattr(wl.Simulator, "lanes", lambda self, number: number)
     monkeypatch.setattr("warp_lcp.methods.workspaces", lambda envs, scalars, device: 7)
-    for case, same in zip(cases, expected, strict=True):
+    for (case, steps), same in zip(cases, expected, strict=True):
         sim = case()
         assert sim.q.strides[0] < sim.q.strides[1]
-        sim.step(200)
+        sim.step(steps)
         assert (bits(sim) == same).all()
 
 

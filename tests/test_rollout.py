@@ -160,10 +160,21 @@ def test_several_bodies():
     assert same_bits(result.body_velocity.numpy()[-1], sim.body_velocity.numpy())
 
 
-def test_threads_and_memory_of_a_gpu_give_the_same_bits(monkeypatch):
+@pytest.mark.parametrize("joints", [False, True])
+def test_threads_and_memory_of_a_gpu_give_the_same_bits(monkeypatch, joints):
     """What a GPU does differently, done on the CPU: environments fastest in memory, a thread for each column of each row."""
-    wrench = pushes(60, 6)
-    expected = randomised(6).rollout(60, wrench, FIELDS, every=7)
+
+    def rollout(sim):
+        control = None
+        if joints:
+            shape = (60, 6, sim.model.nv)
+            control = {name: np.random.default_rng(5).normal(size=shape) for name in ("position", "velocity", "force")}
+        return sim.rollout(60, None if joints else pushes(60, 6), FIELDS, every=7, control=control)
+
+    def make():
+        return simulator(wl.load_usd("quadruped"), 6, 5e-3) if joints else randomised(6)
+
+    expected = rollout(make())
 
     def array(self, n, dtype):
         return wp.zeros((n, self.num_envs), dtype=dtype, device=self.device).transpose()
@@ -173,11 +184,11 @@ def test_threads_and_memory_of_a_gpu_give_the_same_bits(monkeypatch):
 
     monkeypatch.setattr(wl.Simulator, "_array", array)
     monkeypatch.setattr(wl.Simulator, "launch", launch)
-    sim = randomised(6)
+    sim = make()
     recorder = sim._recorder = Recorder(sim)
     recorder.columns = 7
     recorder.step = wp.zeros((6, 7), dtype=int, device=DEVICE)
-    result = sim.rollout(60, wrench, FIELDS, every=7)
+    result = rollout(sim)
     for name in FIELDS:
         assert same_bits(getattr(result, name).numpy(), getattr(expected, name).numpy()), name
 
