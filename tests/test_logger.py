@@ -245,7 +245,10 @@ def test_ball_is_closed_and_turned_outwards():
 
 
 def test_capsules_are_drawn_about_their_middle(tmp_path):
-    """Rerun draws a capsule from z = 0 to its length: it is put back by half of that, so that the pose is that of the shape."""
+    """Rerun draws a capsule from z = 0 to its length: it is put back by half of that, so that the pose is that of the shape.
+
+    And as many as there are lengths (with one for three environments the first alone has its capsule): there are three.
+    """
     half = np.sqrt(0.5)
     builder = wl.ModelBuilder()
     builder.add_plane()
@@ -256,9 +259,9 @@ def test_capsules_are_drawn_about_their_middle(tmp_path):
     _, logger, poses = simulate(path, builder.finalize(), frames=2, every=1)
     for entity, length, radius in (("/world/bodies/pill", 0.6, 0.2), ("/world/static/rail", 4.0, 0.1)):
         found = {c: read(path, entity, f"Capsules3D:{c}")[0][1] for c in ("lengths", "radii", "translations")}
-        assert found["lengths"] == pytest.approx([length])
-        assert found["radii"] == pytest.approx([radius])
-        np.testing.assert_allclose(found["translations"], [(0, 0, -length / 2)], atol=1e-6)
+        assert found["lengths"] == pytest.approx(3 * [length])
+        assert found["radii"] == pytest.approx(3 * [radius])
+        np.testing.assert_allclose(found["translations"], 3 * [(0, 0, -length / 2)], atol=1e-6)
     (_, at) = read(path, "/world/bodies/pill", "InstancePoses3D:translations")[-1]
     np.testing.assert_allclose(at, poses[-1, :, 0, :3] + (0.1, 0, 0) + logger.layout.offsets, atol=1e-6)
     (_, turned) = read(path, "/world/bodies/pill", "InstancePoses3D:quaternions")[-1]

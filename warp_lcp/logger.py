@@ -316,9 +316,11 @@ class RerunLogger:
         see_through = (ShapeType.BOX, ShapeType.CAPSULE, ShapeType.CYLINDER, ShapeType.ELLIPSOID)
         clear = kind in see_through and shape in self._moving  # the forces on it start inside
         mode = rr.components.FillMode.TransparentFillMajorWireframe if clear else rr.components.FillMode.Solid
-        if kind == ShapeType.CAPSULE:  # Rerun's own start at z = 0
-            at = [(0.0, 0.0, -half[1])]
-            return rr.Capsules3D(lengths=[2.0 * half[1]], radii=[half[0]], translations=at, colors=[color], fill_mode=mode)
+        if kind == ShapeType.CAPSULE:
+            # Rerun's own start at z = 0, and are not repeated for each pose: 0.41 draws as many as there are lengths.
+            n = len(self.envs)
+            lengths, radii, at = [2.0 * half[1]] * n, [half[0]] * n, [(0.0, 0.0, -half[1])] * n
+            return rr.Capsules3D(lengths=lengths, radii=radii, translations=at, colors=[color], fill_mode=mode)
         if kind == ShapeType.ELLIPSOID:
             return rr.Ellipsoids3D(half_sizes=[half], colors=[color], fill_mode=mode)
         if kind == ShapeType.CYLINDER:
