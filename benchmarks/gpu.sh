@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Everything to check where there is a GPU: the tests on it and its speed.
+# Everything to check where there is a GPU: the tests on it, its speed, and 4096 randomised environments of every shipped scene.
 #   benchmarks/gpu.sh [DEVICE=cuda:0] [OUT=benchmarks/results]
 # Results are named after the date and kept in OUT; run from the root of a clone with the packages of extra 'dev'.
 set -euo pipefail

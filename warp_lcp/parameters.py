@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Physical parameters of a Model that may differ between environments: which there are, what their numbers may be."""
+"""Physical parameters of a Model that may differ between environments: which there are, what their numbers may be, what becomes of them."""
 
 from __future__ import annotations
 
