@@ -75,6 +75,16 @@ def test_joint_parameters_that_are_none(name, value, message):
         simulator(driven_pair()).set_parameters(**{name: np.array(value)})
 
 
+def test_gains_need_a_drive():
+    """A joint without one, whose greatest force is infinite like that of many drives, takes none; zero, which it has, it takes."""
+    b = wl.ModelBuilder()
+    b.add_joint(JointType.PRISMATIC, -1, b.add_body(mass=1.0, inertia=np.eye(3)), name="slide")
+    sim = simulator(b)
+    sim.set_parameters(gains=sim.model.gains)
+    with pytest.raises(wl.WarpLcpError, match=r"gains\[0, 0, 0\] \(slide\) is 10.*zero without a drive"):
+        sim.set_parameters(gains=[[10.0, 1.0, np.inf]])
+
+
 def test_joint_parameters_need_joints():
     b = wl.ModelBuilder()
     b.add_sphere(b.add_body(), 0.1)

@@ -472,8 +472,8 @@ def driven(path: Path) -> wl.Model:
 def test_robots_walk(request, name):
     """A trot: feet go back by 0.08 m in half of 0.4 s. Without slip that, and what they roll, carries the trunk at 0.43 m/s.
 
-    Over 3 s, after a soft start, it lacks 4.5 to 5.7 %, with drives up to 2.5 times as stiff as well: feet touch early and late, as the
-    trunk sways on two legs. At 5 and 2 ms it is the same speed to 0.6 %; upright, and straight as far as nothing steers.
+    Over 3 s, after a soft start, it lacks 4.5 to 5.7 %, 5 to 6 % with drives 2.5 times as stiff: feet touch early and late, as the trunk
+    sways on two legs. At 5 and 2 ms it is the same speed to 0.6 %; upright, and straight as far as nothing steers.
     """
     period, stride, lift = 0.4, 0.08, 0.06
     if name == "quadruped":
